@@ -1,0 +1,442 @@
+"""Trajectory: named channels with units on one time mesh. Dataset: many of them, in a fixed order.
+
+Everything that enters the package becomes a `Trajectory` and everything that leaves it is one.
+Arrays are ``(time, channel)``; stacked over runs they are ``(sample, channel)``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dfsm.errors import DfsmError, near_matches
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Role = Literal["state", "control", "disturbance", "output", "parameter"]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What is known about one signal.
+
+    Attributes
+    ----------
+    name
+        Name as in the file.
+    unit
+        Unit as in the file, without brackets; never guessed.
+    step
+        Quantisation step in `unit`, where the file states it (16-bit `.outb`), else None. A
+        rounding error is uniform over one step, so its variance is ``step**2 / 12``.
+    role
+        What the signal is to a model, once that has been chosen.
+    """
+
+    name: str
+    unit: str = ""
+    step: float | None = None
+    role: Role | None = None
+
+    @property
+    def label(self) -> str:
+        """Name and unit as an axis label shows them."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One simulation: channels sampled on one strictly increasing time mesh.
+
+    Attributes
+    ----------
+    time
+        Time mesh in s, shape ``(time,)``; it need not be equidistant.
+    values
+        Samples, shape ``(time, channel)``, in the channels' units.
+    channels
+        One `Channel` per column.
+    name
+        Short name of the run, for tables and reports.
+    source
+        The file it was read from, if any.
+    wall_time
+        Seconds the simulator took to produce the span held here, if known.
+    notes
+        What a reader had to leave out or change, one sentence each.
+
+    Raises
+    ------
+    DfsmError
+        Shapes that disagree, duplicated channel names, or a time mesh that does not increase.
+    """
+
+    time: Array
+    values: Array
+    channels: tuple[Channel, ...]
+    name: str = "run"
+    source: str | None = None
+    wall_time: float | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        time = np.array(self.time, dtype=np.float64)
+        values = np.array(self.values, dtype=np.float64)
+        if time.ndim != 1 or values.shape != (len(time), len(self.channels)):
+            raise DfsmError(
+                f"{self.where}: time {time.shape} and values {values.shape} do not fit "
+                f"{len(self.channels)} channels; expected (time,) and (time, channel)"
+            )
+        if len(time) < 2:
+            raise DfsmError(f"{self.where}: {len(time)} samples, at least 2 are needed")
+        _check_time(time, self.where)
+        counts: dict[str, int] = {}
+        for c in self.channels:
+            counts[c.name] = counts.get(c.name, 0) + 1
+        twice = [name for name, n in counts.items() if n > 1]
+        if twice:
+            raise DfsmError(f"{self.where}: channel '{twice[0]}' stands there twice: rename one")
+        time.flags.writeable = False
+        values.flags.writeable = False
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "channels", tuple(self.channels))
+
+    # -- access ---------------------------------------------------------------------------------
+
+    @property
+    def where(self) -> str:
+        """The file, or else the name: how messages refer to this run."""
+        return self.source or self.name
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channel names in column order."""
+        return tuple(c.name for c in self.channels)
+
+    @property
+    def duration(self) -> float:
+        """Last time minus first time, in s."""
+        return float(self.time[-1] - self.time[0])
+
+    @cached_property
+    def time_step(self) -> float | None:
+        """Sampling interval in s if the mesh is equidistant (to 1e-6 of a step), else None."""
+        steps = np.diff(self.time)
+        # A file's times carry rounding of their own, which grows with the time itself.
+        slack = 1e-6 * steps.mean() + 4 * np.spacing(np.abs(self.time).max())
+        return float(steps.mean()) if np.ptp(steps) <= slack else None
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._columns
+
+    def __getitem__(self, name: str) -> Array:
+        """Return the samples of one channel, shape ``(time,)``."""
+        return self.values[:, self.column(name)]
+
+    def column(self, name: str) -> int:
+        """Column of a channel.
+
+        Raises
+        ------
+        DfsmError
+            No such channel; the message names the file and suggests near names.
+        """
+        try:
+            return self._columns[name]
+        except KeyError:
+            raise DfsmError(
+                f"{self.where}: no channel '{name}'; {near_matches(name, self.names)}"
+            ) from None
+
+    def channel(self, name: str) -> Channel:
+        """Return the description of one channel."""
+        return self.channels[self.column(name)]
+
+    @cached_property
+    def _columns(self) -> Mapping[str, int]:
+        return {c.name: i for i, c in enumerate(self.channels)}
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of time, values, names and units: what the run holds, not where it lay."""
+        h = hashlib.sha256()
+        h.update(np.ascontiguousarray(self.time).tobytes())
+        h.update(np.ascontiguousarray(self.values).tobytes())
+        h.update("\0".join(f"{c.name}\0{c.unit}" for c in self.channels).encode())
+        return h.hexdigest()
+
+    # -- new trajectories from old --------------------------------------------------------------
+
+    def select(self, names: Iterable[str]) -> Trajectory:
+        """Keep the named channels, in the order given."""
+        columns = [self.column(n) for n in names]
+        return replace(
+            self,
+            values=self.values[:, columns],
+            channels=tuple(self.channels[i] for i in columns),
+        )
+
+    def window(self, start: float | None = None, stop: float | None = None) -> Trajectory:
+        """Keep ``start <= time <= stop``; the recorded wall time shrinks in proportion.
+
+        Parameters
+        ----------
+        start, stop
+            Times in s; None leaves that end open.
+
+        Raises
+        ------
+        DfsmError
+            Fewer than two samples remain.
+        """
+        slack = 1e-9 * self.duration
+        lo = -np.inf if start is None else start - slack
+        hi = np.inf if stop is None else stop + slack
+        keep = (self.time >= lo) & (self.time <= hi)
+        if keep.sum() < 2:
+            raise DfsmError(
+                f"{self.where}: runs from {self.time[0]:g} s to {self.time[-1]:g} s, shorter than "
+                f"the time window asked for ({start if start is not None else '…'} to "
+                f"{stop if stop is not None else '…'} s): change the window or leave the run out"
+            )
+        time = self.time[keep]
+        part = float(time[-1] - time[0]) / self.duration
+        return replace(
+            self,
+            time=time,
+            values=self.values[keep],
+            wall_time=None if self.wall_time is None else self.wall_time * part,
+        )
+
+    def with_channels(self, channels: Sequence[Channel], values: ArrayLike) -> Trajectory:
+        """Append channels; `values` has shape ``(time, len(channels))``."""
+        values = np.asarray(values, dtype=np.float64).reshape(len(self), len(channels))
+        return replace(
+            self,
+            values=np.concatenate([self.values, values], axis=1),
+            channels=(*self.channels, *channels),
+        )
+
+    def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
+        """Set the roles of the named channels; the others keep theirs."""
+        for name in roles:
+            self.column(name)
+        return replace(
+            self, channels=tuple(replace(c, role=roles.get(c.name, c.role)) for c in self.channels)
+        )
+
+    def require_finite(self) -> Trajectory:
+        """Return self, or fail on the first NaN or Inf.
+
+        Raises
+        ------
+        DfsmError
+            Names the channel, the count and the first time.
+        """
+        bad = ~np.isfinite(self.values)
+        if bad.any():
+            column = int(np.flatnonzero(bad.any(axis=0))[0])
+            rows = np.flatnonzero(bad[:, column])
+            raise DfsmError(
+                f"{self.where}: channel '{self.names[column]}' has {len(rows)} NaN or infinite "
+                f"samples, the first at {self.time[rows[0]]:g} s: leave the channel or that part "
+                "of the run out"
+            )
+        return self
+
+    def resample(self, time: ArrayLike) -> Trajectory:
+        """Interpolate linearly onto another mesh inside this one's span."""
+        time = np.asarray(time, dtype=np.float64)
+        values = np.stack([np.interp(time, self.time, v) for v in self.values.T], axis=1)
+        return replace(self, time=time, values=values)
+
+    # -- pandas ---------------------------------------------------------------------------------
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table indexed by time; units are in ``frame.attrs['units']``."""
+        import pandas as pd
+
+        frame = pd.DataFrame(
+            self.values, index=pd.Index(self.time, name="Time"), columns=list(self.names)
+        )
+        frame.attrs["units"] = {c.name: c.unit for c in self.channels}
+        return frame
+
+    @classmethod
+    def from_pandas(
+        cls,
+        frame: pd.DataFrame,
+        units: Mapping[str, str] | None = None,
+        *,
+        name: str = "run",
+        source: str | None = None,
+    ) -> Trajectory:
+        """Build a trajectory from a table indexed by time in s.
+
+        Parameters
+        ----------
+        frame
+            One column per channel; the index is time.
+        units
+            Unit per column; default ``frame.attrs['units']``, and no unit where neither says.
+        name, source
+            See `Trajectory`.
+
+        Raises
+        ------
+        DfsmError
+            A column or the index is not numeric.
+        """
+        known: Mapping[str, str] = frame.attrs.get("units", {}) if units is None else units
+        where = source or name
+        columns = []
+        for column in frame.columns:
+            try:
+                columns.append(frame[column].to_numpy(dtype=np.float64))
+            except (TypeError, ValueError) as error:
+                raise DfsmError(f"{where}: column '{column}' is not numeric ({error})") from None
+        try:
+            time = frame.index.to_numpy(dtype=np.float64)
+        except (TypeError, ValueError):
+            raise DfsmError(f"{where}: the index is not time in s; set it to the time") from None
+        channels = tuple(Channel(str(c), known.get(str(c), "")) for c in frame.columns)
+        return cls(time, np.stack(columns, axis=1), channels, name=name, source=source)
+
+
+class Dataset(Sequence[Trajectory]):
+    """Runs in an order given by their content, so that the order of files never matters.
+
+    Meshes and lengths may differ from run to run. The runs share at least one channel.
+
+    Raises
+    ------
+    DfsmError
+        No runs; the same run twice; no common channel.
+    """
+
+    def __init__(self, runs: Iterable[Trajectory]) -> None:
+        self.runs: tuple[Trajectory, ...] = tuple(sorted(runs, key=lambda r: r.digest))
+        if not self.runs:
+            raise DfsmError("no runs were given, at least one is needed")
+        for a, b in zip(self.runs, self.runs[1:], strict=False):
+            if a.digest == b.digest:
+                raise DfsmError(
+                    f"{a.where} and {b.where} hold the same data: give each run once, "
+                    "a repeated one would count twice"
+                )
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    @overload
+    def __getitem__(self, index: int) -> Trajectory: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Trajectory, ...]: ...
+    def __getitem__(self, index: int | slice) -> Trajectory | tuple[Trajectory, ...]:
+        """Return one run, or a tuple of runs for a slice."""
+        return self.runs[index]
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return iter(self.runs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channels that every run has, in the first run's order."""
+        common = set(self.runs[0].names).intersection(*(r.names for r in self.runs))
+        return tuple(n for n in self.runs[0].names if n in common)
+
+    def channel(self, name: str) -> Channel:
+        """Describe a channel over all runs: its unit, and the coarsest quantisation step.
+
+        Raises
+        ------
+        DfsmError
+            A run lacks the channel, or two runs give it different units.
+        """
+        first = self.runs[0].channel(name)
+        steps = []
+        for run in self.runs:
+            channel = run.channel(name)
+            steps.append(channel.step)
+            if channel.unit != first.unit:
+                raise DfsmError(
+                    f"channel '{name}' is in '{first.unit}' in {self.runs[0].where} but in "
+                    f"'{channel.unit}' in {run.where}: convert one of them"
+                )
+        known = [s for s in steps if s is not None]
+        return replace(first, step=max(known) if known else None)
+
+    def select(self, names: Iterable[str]) -> Dataset:
+        """Keep the named channels of every run; units must agree between runs."""
+        names = tuple(names)
+        selected = [r.select(names) for r in self.runs]
+        for name in names:
+            self.channel(name)
+        return Dataset(selected)
+
+    def window(self, start: float | None = None, stop: float | None = None) -> Dataset:
+        """Keep a time window (s) of every run, see `Trajectory.window`."""
+        return Dataset(r.window(start, stop) for r in self.runs)
+
+    def split(self, test_fraction: float = 0.2, seed: int = 0) -> tuple[Dataset, Dataset]:
+        """Split by run, never within one: neighbouring samples are not independent.
+
+        Parameters
+        ----------
+        test_fraction
+            Share of the runs for the second part, rounded to at least one run.
+        seed
+            Seed of the draw.
+
+        Returns
+        -------
+        tuple[Dataset, Dataset]
+            Training and test runs.
+
+        Raises
+        ------
+        DfsmError
+            Fewer than two runs, or a fraction outside (0, 1).
+        """
+        if not 0 < test_fraction < 1:
+            raise DfsmError(f"test_fraction is {test_fraction}, expected between 0 and 1")
+        if len(self) < 2:
+            raise DfsmError("one run cannot be split into training and test: give more runs")
+        n_test = min(len(self) - 1, max(1, round(test_fraction * len(self))))
+        test = set(np.random.default_rng(seed).permutation(len(self))[:n_test].tolist())
+        return (
+            Dataset(r for i, r in enumerate(self.runs) if i not in test),
+            Dataset(r for i, r in enumerate(self.runs) if i in test),
+        )
+
+    def stack(self, names: Iterable[str]) -> Array:
+        """Lay the samples of all runs below each other, shape ``(sample, channel)``."""
+        names = tuple(names)
+        return np.concatenate([r.select(names).values for r in self.runs])
+
+
+def _check_time(time: Array, where: str) -> None:
+    if not np.isfinite(time).all():
+        row = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise DfsmError(f"{where}: time is not a finite number in sample {row}")
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        row = int(np.flatnonzero(steps <= 0)[0]) + 1
+        what = "repeats" if math.isclose(time[row], time[row - 1]) else "goes back"
+        raise DfsmError(
+            f"{where}: time {what} at sample {row} ({time[row - 1]:g} s, then {time[row]:g} s); "
+            "a strictly increasing time is needed: sort the file or drop the repeated samples"
+        )
