@@ -14,15 +14,15 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dfsm.errors import DfsmError, near_matches
+from dfsm.types import Array
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Role = Literal["state", "control", "disturbance", "output", "parameter"]
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -258,8 +258,22 @@ class Trajectory:
         return self
 
     def resample(self, time: ArrayLike) -> Trajectory:
-        """Interpolate linearly onto another mesh inside this one's span."""
+        """Interpolate linearly onto another mesh inside this one's span.
+
+        Raises
+        ------
+        DfsmError
+            The mesh reaches outside this run's span, or does not increase.
+        """
         time = np.asarray(time, dtype=np.float64)
+        slack = 1e-9 * self.duration
+        if time.size and not (
+            time.min() >= self.time[0] - slack and time.max() <= self.time[-1] + slack
+        ):
+            raise DfsmError(
+                f"{self.where}: runs from {self.time[0]:g} s to {self.time[-1]:g} s, but samples "
+                f"from {time.min():g} s to {time.max():g} s were asked for: stay inside the run"
+            )
         values = np.stack([np.interp(time, self.time, v) for v in self.values.T], axis=1)
         return replace(self, time=time, values=values)
 
@@ -298,14 +312,19 @@ class Trajectory:
         Raises
         ------
         DfsmError
-            A column or the index is not numeric.
+            There is no column, or a column or the index is not numeric.
         """
         known: Mapping[str, str] = frame.attrs.get("units", {}) if units is None else units
         where = source or name
         columns = []
-        for column in frame.columns:
+        if not len(frame.columns):
+            raise DfsmError(
+                f"{where}: the table has no column besides its index, expected channels"
+            )
+        # By position: a name that stands twice is told by the constructor below.
+        for i, column in enumerate(frame.columns):
             try:
-                columns.append(frame[column].to_numpy(dtype=np.float64))
+                columns.append(frame.iloc[:, i].to_numpy(dtype=np.float64))
             except (TypeError, ValueError) as error:
                 raise DfsmError(f"{where}: column '{column}' is not numeric ({error})") from None
         try:
@@ -337,6 +356,11 @@ class Dataset(Sequence[Trajectory]):
                     f"{a.where} and {b.where} hold the same data: give each run once, "
                     "a repeated one would count twice"
                 )
+        if not self.names and any(r.names for r in self.runs):
+            raise DfsmError(
+                f"the {len(self.runs)} runs have no channel in common ({self.runs[0].where} has "
+                f"{', '.join(self.runs[0].names[:6]) or 'none'}): check that they belong together"
+            )
 
     def __len__(self) -> int:
         return len(self.runs)

@@ -1,0 +1,87 @@
+"""The nonlinear error-corrective function e(I): what the linear fit leaves over (Sec. 3.6).
+
+One file per kind of training (`rbf`, `gaussian_process`, `perceptron`); what comes out is one of
+the two JAX modules in `functions`. Inputs are standardised inside; the values that go in and come
+out are in physical units.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dfsm.corrective.functions import Corrective, GaussianUnits, Perceptron
+from dfsm.corrective.gaussian_process import GP, fit_gp
+from dfsm.corrective.perceptron import MLP, fit_mlp
+from dfsm.corrective.rbf import RBF, IncrementalRBF, fit_rbf
+from dfsm.corrective.training import CorrectiveFit, TrainingSet
+from dfsm.sampling import subsample
+from dfsm.settings import settings
+from dfsm.types import Array, IntArray
+
+__all__ = [
+    "GP",
+    "MLP",
+    "RBF",
+    "Corrective",
+    "CorrectiveChoice",
+    "CorrectiveFit",
+    "GaussianUnits",
+    "IncrementalRBF",
+    "NoCorrection",
+    "Perceptron",
+    "fit_corrective",
+]
+
+
+@settings
+class NoCorrection:
+    """Leave the linear fit as it is."""
+
+    kind: Literal["none"] = "none"
+
+
+CorrectiveChoice = RBF | IncrementalRBF | GP | MLP | NoCorrection
+
+
+def fit_corrective(
+    inputs: Array,
+    residuals: Array,
+    runs: IntArray,
+    choice: RBF | IncrementalRBF | GP | MLP,
+    seed: int = 0,
+) -> CorrectiveFit:
+    """Train a corrective function on the residuals of the linear fit (Sec. 3.6).
+
+    Parameters
+    ----------
+    inputs
+        Shape ``(sample, input)``, physical units.
+    residuals
+        Shape ``(sample, target)``, physical units.
+    runs
+        Run index of each sample from 0, shape ``(sample,)``: cross-validation leaves out whole
+        runs, because neighbouring samples of one run are nearly copies.
+    choice
+        Kind and settings.
+    seed
+        Seed of subsampling and initial weights.
+
+    Returns
+    -------
+    CorrectiveFit
+
+    Raises
+    ------
+    DfsmError
+        More units than samples.
+    """
+    data = TrainingSet.build(inputs, residuals, runs)
+    if isinstance(choice, MLP):
+        return fit_mlp(data, choice, seed)
+    points = subsample(data.z, choice.samples, choice.sampling, seed)
+    if isinstance(choice, GP):
+        return fit_gp(data, points, choice, seed)
+    return fit_rbf(data, points, choice)

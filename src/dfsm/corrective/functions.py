@@ -1,0 +1,62 @@
+"""The two forms that every corrective function takes when it is evaluated."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import dfsm.precision  # noqa: F401
+
+
+class GaussianUnits(eqx.Module):
+    """Σ_i w_i exp(-|z - c_i|²) + bias, with ``z = (I - shift) / scale`` (Eq. 8).
+
+    Attributes
+    ----------
+    shift, scale
+        Per input, shape ``(input,)``; the scale holds the width of the units.
+    centres
+        In z, shape ``(unit, input)``.
+    weights, bias
+        In the unit of the target, shapes ``(unit, target)`` and ``(target,)``.
+    """
+
+    shift: jax.Array
+    scale: jax.Array
+    centres: jax.Array
+    weights: jax.Array
+    bias: jax.Array
+
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
+        z = (inputs - self.shift) / self.scale
+        squared = jnp.sum((self.centres - z) ** 2, axis=1)
+        return jnp.exp(-squared) @ self.weights + self.bias
+
+
+class Perceptron(eqx.Module):
+    """Fully connected tanh network on standardised inputs, linear output layer.
+
+    Attributes
+    ----------
+    shift, scale
+        Per input, shape ``(input,)``.
+    weights, biases
+        Per layer, shapes ``(out, in)`` and ``(out,)``; the last layer is in the target's unit.
+    """
+
+    shift: jax.Array
+    scale: jax.Array
+    weights: tuple[jax.Array, ...]
+    biases: tuple[jax.Array, ...]
+
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
+        z = (inputs - self.shift) / self.scale
+        for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            z = jnp.tanh(W @ z + b)
+        return self.weights[-1] @ z + self.biases[-1]
+
+
+Corrective = GaussianUnits | Perceptron

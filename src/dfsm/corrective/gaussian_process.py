@@ -1,0 +1,105 @@
+"""Gaussian process regression, exact on cluster means or sparse on all samples."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from dfsm.corrective.training import CorrectiveFit, TrainingSet, cross_validated
+from dfsm.corrective.units import activations, gaussian_units, mean_diagonal, unit_sums
+from dfsm.sampling import Method, Subsample
+from dfsm.settings import settings
+from dfsm.types import Array
+
+
+@settings
+class GP:
+    """Gaussian process with one length scale per input, hyper-parameters by marginal likelihood.
+
+    Attributes
+    ----------
+    samples
+        Number of cluster means it is trained on, or of inducing points.
+    sampling
+        How they are chosen, see `subsample`.
+    targets
+        ``"cluster_means"``: exact regression on the means. ``"all"``: the means give the
+        hyper-parameters and every sample enters through the inducing points (subset of
+        regressors, Quiñonero-Candela & Rasmussen 2005).
+    """
+
+    kind: Literal["gp"] = "gp"
+    samples: int = 200
+    sampling: Method = "kmeans"
+    targets: Literal["all", "cluster_means"] = "all"
+
+
+def fit_gp(data: TrainingSet, points: Subsample, choice: GP, seed: int) -> CorrectiveFit:
+    """Train a Gaussian process; one kernel is shared by all targets."""
+    means = points.means(data.targets)
+    signal, noise, lengths = _hyper_parameters(points.points, means, seed)
+    kernel = _Kernel(points.points, np.sqrt(2.0) * lengths, signal)
+    # The scatter within the clusters is the noise of single samples; that of means is smaller.
+    scatter = noise + float(np.mean((data.targets - means[points.labels]) ** 2))
+    if choice.targets == "all":
+        weights = kernel.sparse_weights(data, scatter)
+    else:
+        weights = kernel.exact_weights(means, noise)
+    bias = np.zeros(means.shape[1])
+    return CorrectiveFit(
+        function=gaussian_units(data, kernel.points, kernel.width, weights, bias),
+        explained=cross_validated(data, lambda rest: kernel.predictor(rest, scatter)),
+        detail=f"{len(means)} points, length scales " + ", ".join(f"{v:.2g}" for v in lengths),
+    )
+
+
+@dataclass(frozen=True)
+class _Kernel:
+    """Squared-exponential kernel on fixed points, ``signal exp(-|z - z'|² / width²)``."""
+
+    points: Array
+    width: Array
+    signal: float
+
+    @property
+    def gram(self) -> Array:
+        return self.signal * activations(self.points, self.points, self.width)
+
+    def exact_weights(self, targets: Array, noise: float) -> Array:
+        """Weights of the units for exact regression on the points' own targets."""
+        K = self.gram
+        jitter = 1e-10 * mean_diagonal(K)
+        return self.signal * np.linalg.solve(K + (noise + jitter) * np.eye(len(K)), targets)
+
+    def sparse_weights(self, data: TrainingSet, noise: float) -> Array:
+        """Weights of the units from all samples: (K_mn K_nm + noise K_mm)⁻¹ K_mn y."""
+        n, K = len(self.points), self.gram
+        products = unit_sums(data.z, data.targets, self.points, self.width).products
+        A = self.signal**2 * products[:n, :n] + noise * K
+        right = self.signal * products[:n, n:]
+        return self.signal * np.linalg.solve(A + 1e-10 * mean_diagonal(A) * np.eye(n), right)
+
+    def predictor(self, data: TrainingSet, noise: float) -> Callable[[Array], Array]:
+        weights = self.sparse_weights(data, noise)
+        return lambda z: activations(z, self.points, self.width) @ weights
+
+
+def _hyper_parameters(z: Array, targets: Array, seed: int) -> tuple[float, float, Array]:
+    """Signal variance, noise variance and length scales that maximise the marginal likelihood."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor, kernels
+
+    d = z.shape[1]
+    lengths: Any = np.full(d, np.sqrt(d))
+    kernel = kernels.ConstantKernel(0.5, (1e-4, 1e3)) * kernels.RBF(lengths, (0.2, 1e3))
+    kernel = kernel + kernels.WhiteKernel(0.1, (1e-10, 1e2))
+    with warnings.catch_warnings():
+        # A length scale at its bound means an input that does not matter: nothing to act on.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted: Any = GaussianProcessRegressor(kernel, random_state=seed).fit(z, targets).kernel_
+    lengths = np.broadcast_to(fitted.k1.k2.length_scale, (d,))
+    return float(fitted.k1.k1.constant_value), float(fitted.k2.noise_level), lengths

@@ -1,0 +1,115 @@
+"""What every kind of corrective function is trained on, and what training returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dfsm.corrective.functions import Corrective
+from dfsm.types import Array, IntArray
+
+# Cross-validation and iterative training see at most this many samples, evenly thinned.
+SEARCH_SAMPLES = 12_000
+
+
+@dataclass(frozen=True)
+class CorrectiveFit:
+    """A trained corrective function and what cross-validation says about it.
+
+    Attributes
+    ----------
+    function
+        Maps an input vector to the corrections of the targets it was trained on.
+    explained
+        Share of each target's residual variance that it explains on runs left out of training,
+        shape ``(target,)``; at or below zero it does not generalise.
+    detail
+        What was chosen, in words.
+    """
+
+    function: Corrective
+    explained: Array
+    detail: str
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Standardised samples: what every kind of corrective function is trained on.
+
+    Attributes
+    ----------
+    z
+        Standardised inputs, shape ``(sample, input)``.
+    targets
+        Residuals scaled to unit variance, shape ``(sample, target)``.
+    folds
+        Cross-validation fold of each sample, shape ``(sample,)``; a run is never split over two
+        folds unless there are fewer than two runs.
+    shift, scale, target_scale
+        The standardisation.
+    """
+
+    z: Array
+    targets: Array
+    folds: IntArray
+    shift: Array
+    scale: Array
+    target_scale: Array
+
+    @classmethod
+    def build(cls, inputs: Array, targets: Array, runs: IntArray) -> TrainingSet:
+        """Standardise samples; `runs` holds the run index of each, shape ``(sample,)``."""
+        shift, scale = inputs.mean(0), inputs.std(0)
+        scale = np.where(scale > 1e-12 * np.maximum(np.abs(shift), 1e-300), scale, 1.0)
+        target_scale = np.maximum(targets.std(0), np.finfo(float).tiny)
+        n_runs = int(runs.max()) + 1
+        if n_runs > 1:
+            folds = (runs * min(4, n_runs)) // n_runs
+        else:
+            folds = (np.arange(len(inputs)) * 4) // len(inputs)
+        return cls(
+            (inputs - shift) / scale, targets / target_scale, folds, shift, scale, target_scale
+        )
+
+    def thinned(self, size: int) -> TrainingSet:
+        """Keep every k-th sample so that at most `size` remain."""
+        k = max(1, -(-len(self.z) // size))
+        return replace(self, z=self.z[::k], targets=self.targets[::k], folds=self.folds[::k])
+
+    @property
+    def typical_distance(self) -> float:
+        """Root-mean-square distance between two samples drawn at random."""
+        return float(np.sqrt(2 * self.z.var(0).sum()))
+
+    def subset(self, keep: NDArray[np.bool_]) -> TrainingSet:
+        """Keep some samples under the same standardisation."""
+        return replace(self, z=self.z[keep], targets=self.targets[keep], folds=self.folds[keep])
+
+
+def cross_validated(
+    data: TrainingSet, train: Callable[[TrainingSet], Callable[[Array], Array]]
+) -> Array:
+    """Share of each target's variance explained on folds left out of training.
+
+    Parameters
+    ----------
+    data
+        All samples; a thinned copy is used.
+    train
+        Maps a training set to a function from ``(sample, input)`` to ``(sample, target)``.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(target,)``; at most 1.
+    """
+    data = data.thinned(SEARCH_SAMPLES)
+    squared, total = np.zeros(data.targets.shape[1]), np.zeros(data.targets.shape[1])
+    for k in np.unique(data.folds):
+        rest, held = data.subset(data.folds != k), data.subset(data.folds == k)
+        squared += ((held.targets - train(rest)(held.z)) ** 2).sum(0)
+        total += ((held.targets - rest.targets.mean(0)) ** 2).sum(0)
+    return 1 - squared / total

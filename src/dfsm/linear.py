@@ -1,0 +1,390 @@
+"""Linear fit of derivatives and outputs: LTI, and LPV in a scheduling signal (Sec. 3.4).
+
+    f̂_L(I; w) = L(w) (I - Ī) + c = L(w) I + b(w),      I = [u, w, ξ, p]
+
+One pass over the data accumulates the normal equations of every scheduling window, so memory does
+not grow with the number of samples. Windows overlap; between their centres the coefficients are
+interpolated linearly, so the model is continuous in the schedule and every L(w) is a convex
+combination of two fitted ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dfsm.precision  # noqa: F401
+from dfsm.errors import DfsmError
+from dfsm.settings import settings
+from dfsm.types import Array, IntArray
+
+# Rows per block of the accumulation: a block of tens of columns stays in the cache.
+_BLOCK = 8192
+# Two input directions whose standardised spread differs by more than this cannot be told apart
+# by least squares in 64-bit normal equations with a few digits to spare.
+CONDITION_LIMIT = 1e4
+
+
+@settings
+class LTI:
+    """One linear fit for all samples.
+
+    Attributes
+    ----------
+    affine
+        Fit an offset (centred regression). False is the paper's ``L = Ẋ Iᵀ (I Iᵀ)⁻¹``.
+    """
+
+    kind: Literal["LTI"] = "LTI"
+    affine: bool = True
+
+
+@settings
+class LPV:
+    """Linear fits in overlapping windows of a scheduling signal, interpolated between them.
+
+    Attributes
+    ----------
+    schedule
+        The disturbance (or other input) that the coefficients depend on, e.g. the wind speed.
+    points
+        Number of windows, at least 2.
+    affine
+        Fit an offset in every window.
+    """
+
+    kind: Literal["LPV"] = "LPV"
+    schedule: str
+    points: int = 5
+    affine: bool = True
+
+
+class LinearModel(eqx.Module):
+    """Affine map ``y = L(s) I + b(s)`` whose coefficients are interpolated in a schedule ``s``.
+
+    Attributes
+    ----------
+    grid
+        Schedule points in the schedule's unit, shape ``(point,)``; one point for an LTI model.
+    coefficients
+        L at every schedule point, in physical units, shape ``(point, target, input)``.
+    offsets
+        b at every schedule point, shape ``(point, target)``.
+    schedule
+        Column of the input vector that schedules, None for an LTI model.
+    """
+
+    grid: jax.Array
+    coefficients: jax.Array
+    offsets: jax.Array
+    schedule: int | None = eqx.field(static=True)
+
+    def at(self, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+        """Return L, shape ``(target, input)``, and b, shape ``(target,)``, at a schedule value.
+
+        Outside the grid the coefficients of the nearest point hold.
+        """
+        if self.schedule is None:
+            return self.coefficients[0], self.offsets[0]
+        n = self.grid.shape[0]
+        value = jnp.clip(value, self.grid[0], self.grid[-1])
+        i = jnp.clip(jnp.sum(value >= self.grid) - 1, 0, n - 2)
+        t = (value - self.grid[i]) / (self.grid[i + 1] - self.grid[i])
+        L = (1 - t) * self.coefficients[i] + t * self.coefficients[i + 1]
+        b = (1 - t) * self.offsets[i] + t * self.offsets[i + 1]
+        return L, b
+
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
+        L, b = self.at(inputs[self.schedule] if self.schedule is not None else 0.0)
+        return L @ inputs + b
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """A linear model and how well it fits its training samples.
+
+    Attributes
+    ----------
+    model
+        The fitted map.
+    residual_rms, target_std
+        Per target, over all samples, in the target's unit. The residual of an LPV model is
+        that of each window's own fit.
+    samples
+        Samples per window, shape ``(point,)``.
+    windows
+        Schedule range of every window, shape ``(point, 2)``; empty for an LTI model.
+    condition
+        Condition number of the standardised inputs, worst window.
+    warnings
+        Sentences that name inputs which the data cannot tell apart.
+    """
+
+    model: LinearModel
+    residual_rms: Array
+    target_std: Array
+    samples: IntArray
+    windows: Array
+    condition: float
+    warnings: tuple[str, ...]
+
+
+class NormalEquations:
+    """Sums that a least-squares fit of targets on inputs needs, collected block by block.
+
+    Sums are taken about a fixed shift close to the mean, because the difference of two large
+    uncentred sums would lose the digits that the fit lives on.
+
+    Parameters
+    ----------
+    shift
+        Reference point for ``[inputs, targets]``, shape ``(input + target,)``; use the mean of
+        any block of data, or zeros for a fit without offset.
+    n_inputs
+        How many of the columns are inputs.
+    """
+
+    def __init__(self, shift: Array, n_inputs: int) -> None:
+        self.shift = np.asarray(shift, dtype=np.float64)
+        self.n_inputs = n_inputs
+        self.count = 0
+        self.sums = np.zeros(len(self.shift))
+        self.products = np.zeros((len(self.shift), len(self.shift)))
+
+    def add(self, inputs: Array, targets: Array) -> None:
+        """Add samples: `inputs` ``(sample, input)`` and `targets` ``(sample, target)``."""
+        # Channels as rows: contiguous, so that the product runs at the speed of the memory.
+        block = np.empty((len(self.shift), _BLOCK))
+        m = self.n_inputs
+        for start in range(0, len(inputs), _BLOCK):
+            stop = min(start + _BLOCK, len(inputs))
+            z = block[:, : stop - start]
+            np.subtract(inputs[start:stop].T, self.shift[:m, None], out=z[:m])
+            np.subtract(targets[start:stop].T, self.shift[m:, None], out=z[m:])
+            self.products += z @ z.T
+            self.sums += z.sum(axis=1)
+        self.count += len(inputs)
+
+    def moments(self, centred: bool) -> tuple[Array, Array]:
+        """Return the mean, and the mean products about it (about zero if not `centred`)."""
+        offset = self.sums / self.count
+        if centred:
+            return self.shift + offset, self.products / self.count - np.outer(offset, offset)
+        if self.shift.any():
+            raise ValueError("uncentred moments need sums about zero")
+        return np.zeros_like(self.shift), self.products / self.count
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of every input and target."""
+        offset = self.sums / self.count
+        return np.sqrt(np.maximum(np.diag(self.products) / self.count - offset**2, 0.0))
+
+    def solve(self, affine: bool) -> Solution:
+        """Solve for the coefficients, in the minimum-norm sense of the standardised inputs."""
+        mean, products = self.moments(centred=affine)
+        m = self.n_inputs
+        scale = np.sqrt(np.maximum(np.diag(products)[:m], 0.0))
+        # A column that does not vary gets no coefficient; any scale but zero will do.
+        scale[scale <= 1e-12 * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)] = np.inf
+        Q = products[:m, :m] / np.outer(scale, scale)
+        eigenvalues, V = np.linalg.eigh(Q)
+        floor = eigenvalues[-1] * max(1e-13, 10 * m * np.finfo(float).eps)
+        used = eigenvalues > floor
+        inverse = np.where(used, 1 / np.where(used, eigenvalues, 1.0), 0.0)
+        right = products[:m, m:] / scale[:, None]
+        X = V @ (inverse[:, None] * (V.T @ right))
+        L = (X / scale[:, None]).T
+        rss = np.diag(products)[m:] - np.einsum("ij,ij->j", 2 * right - Q @ X, X)
+        return Solution(
+            coefficients=L,
+            offset=mean[m:] - L @ mean[:m],
+            residual_variance=np.maximum(rss, 0.0),
+            target_variance=np.maximum(np.diag(products)[m:], 0.0),
+            eigenvalues=np.maximum(eigenvalues, 0.0),
+            directions=V,
+        )
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Coefficients of one least-squares fit with the figures that judge it."""
+
+    coefficients: Array
+    offset: Array
+    residual_variance: Array
+    target_variance: Array
+    eigenvalues: Array
+    directions: Array
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the standardised inputs."""
+        low = self.eigenvalues[0]
+        return float(np.sqrt(self.eigenvalues[-1] / low)) if low > 0 else float("inf")
+
+    def confounded(self, names: list[str]) -> list[str]:
+        """Name the inputs that dominate the direction in which the data hardly vary."""
+        weight = np.abs(self.directions[:, 0])
+        return [names[i] for i in np.argsort(-weight) if weight[i] > 0.3 * weight.max()]
+
+
+def schedule_windows(schedule: Array, points: int) -> Array:
+    """Overlapping windows of equal width over the range of a schedule, ends included.
+
+    The first window starts at the 0.5th percentile and the last ends at the 99.5th, so that
+    those at the ends are as wide as the others and as well filled as the data allow.
+
+    Parameters
+    ----------
+    schedule
+        Schedule samples of all runs, shape ``(sample,)``.
+    points
+        Number of windows.
+
+    Returns
+    -------
+    ndarray
+        Lower and upper end of every window, shape ``(point, 2)``; neighbours overlap by half.
+
+    Raises
+    ------
+    DfsmError
+        Fewer than two points, or a schedule that does not vary.
+    """
+    if points < 2:
+        raise DfsmError(f"linear.points is {points}, an LPV fit needs at least 2: raise it, or LTI")
+    low, high = np.percentile(schedule, [0.5, 99.5])
+    if not high > low:
+        raise DfsmError(
+            f"the schedule does not vary (always {low:g}): use an LTI fit or another schedule"
+        )
+    half = (high - low) / (points + 1)
+    centres = low + half * np.arange(1, points + 1)
+    return np.stack([centres - half, centres + half], axis=1)
+
+
+def fit_linear(
+    blocks: Iterable[tuple[Array, Array]],
+    input_names: Sequence[str],
+    choice: LTI | LPV,
+    windows: Array | None = None,
+) -> LinearFit:
+    """Fit targets on inputs in one pass over blocks of samples (Sec. 3.4, Eq. 7).
+
+    Parameters
+    ----------
+    blocks
+        Pairs of inputs ``(sample, input)`` and targets ``(sample, target)``, one pair per run or
+        part of one. They are read once and not kept.
+    input_names
+        Names of the input columns, for the schedule and for messages.
+    choice
+        `LTI` or `LPV`.
+    windows
+        Schedule windows from `schedule_windows`; needed for an LPV fit.
+
+    Returns
+    -------
+    LinearFit
+        The model in physical units and its figures of merit.
+
+    Raises
+    ------
+    DfsmError
+        Fewer samples than unknowns, in all or in one window.
+    """
+    lpv = isinstance(choice, LPV)
+    column = list(input_names).index(choice.schedule) if isinstance(choice, LPV) else None
+    windows = np.empty((0, 2)) if windows is None or not lpv else windows
+    sums: list[NormalEquations] = []
+    m, schedule_sums = len(input_names), np.zeros(len(windows))
+    for inputs, targets in blocks:
+        if not sums:
+            width = m + targets.shape[1]
+            first = np.concatenate([inputs[:_BLOCK].mean(0), targets[:_BLOCK].mean(0)])
+            shift = first if choice.affine else np.zeros(width)
+            sums = [NormalEquations(shift, m) for _ in range(max(1, len(windows)))]
+        if not lpv:
+            sums[0].add(inputs, targets)
+            continue
+        s = inputs[:, column]
+        for k, (low, high) in enumerate(windows):
+            inside = (s >= low) & (s <= high)
+            # The end windows also take what lies beyond them: no sample is left out.
+            inside |= (s < low) & (k == 0) | (s > high) & (k == len(windows) - 1)
+            sums[k].add(inputs[inside], targets[inside])
+            schedule_sums[k] += s[inside].sum()
+    _check_counts(sums, windows, choice)
+    solutions = [e.solve(choice.affine) for e in sums]
+    counts = np.array([e.count for e in sums])
+    grid = schedule_sums / counts if lpv else np.zeros(1)
+    model = LinearModel(
+        grid=jnp.asarray(grid),
+        coefficients=jnp.asarray(np.stack([s.coefficients for s in solutions])),
+        offsets=jnp.asarray(np.stack([s.offset for s in solutions])),
+        schedule=column,
+    )
+    weights = counts / counts.sum()
+    return LinearFit(
+        model=model,
+        residual_rms=np.sqrt(
+            sum(w * s.residual_variance for w, s in zip(weights, solutions, strict=True))
+        ),
+        target_std=merge(sums).std[m:],
+        samples=counts,
+        windows=windows,
+        condition=max(s.condition for s in solutions),
+        warnings=_warnings(solutions, grid, input_names, choice),
+    )
+
+
+def merge(parts: Sequence[NormalEquations]) -> NormalEquations:
+    """Add up sums that were taken about the same shift."""
+    total = NormalEquations(parts[0].shift, parts[0].n_inputs)
+    for part in parts:
+        total.count += part.count
+        total.sums += part.sums
+        total.products += part.products
+    return total
+
+
+def _check_counts(sums: Sequence[NormalEquations], windows: Array, choice: LTI | LPV) -> None:
+    if not sums or not sum(e.count for e in sums):
+        raise DfsmError("no samples to fit: give at least one run")
+    unknowns = sums[0].n_inputs + int(choice.affine)
+    for k, e in enumerate(sums):
+        if e.count < unknowns:
+            where = (
+                f" in the window {windows[k, 0]:.4g} to {windows[k, 1]:.4g}" if len(windows) else ""
+            )
+            cure = "use fewer linear.points or more runs" if len(windows) else "give more samples"
+            raise DfsmError(
+                f"{e.count} samples{where} for {unknowns} unknowns per target of the linear fit: "
+                f"{cure}"
+            )
+
+
+def _warnings(
+    solutions: Sequence[Solution], grid: Array, names: Sequence[str], choice: LTI | LPV
+) -> tuple[str, ...]:
+    worst = [(s.condition, g, s) for s, g in zip(solutions, grid, strict=True)]
+    worst = [item for item in worst if item[0] > CONDITION_LIMIT]
+    if not worst:
+        return ()
+    condition, point, solution = max(worst, key=lambda item: item[0])
+    where = f" near {choice.schedule} = {point:.4g}" if isinstance(choice, LPV) else ""
+    which = ", ".join(solution.confounded(list(names)))
+    figure = f"{condition:.1e}" if np.isfinite(condition) else "infinite"
+    return (
+        f"the runs cannot tell these inputs apart{where}: {which} (condition number {figure}); "
+        "predictions hold where the inputs stay related as in the training runs, "
+        "the separate coefficients mean little",
+    )

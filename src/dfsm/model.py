@@ -1,0 +1,408 @@
+"""DFSM: the surrogate ξ̇ = f̂(ξ, u, w, p) and y = ĝ(ξ, u, w, p) as one immutable JAX pytree.
+
+    f̂(I) = f̂_L(I; s) + e(I)        ĝ(I) = ĝ_L(I; s) + e_g(I)        I = [u, w, ξ, p]
+
+The linear parts are defined for every row; the corrective functions only for the rows that need
+one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `derivative` and
+`output`, so simulation, Jacobians and optimisation see the same function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+import dfsm.precision  # noqa: F401
+from dfsm.corrective.functions import Corrective
+from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.errors import DfsmError, near_matches
+from dfsm.linear import LinearModel
+from dfsm.settings import settings
+from dfsm.trajectory import Channel
+from dfsm.types import Array
+
+if TYPE_CHECKING:
+    import control
+
+
+# Radians per second in one unit of a rotor or generator speed.
+_SPEED_UNITS = {"rpm": np.pi / 30, "rad/s": 1.0, "deg/s": np.pi / 180}
+
+
+@settings
+class Azimuth:
+    """Blade-passing harmonics of the rotor azimuth ψ = ∫ω dt as inputs of ĝ (Sec. 3.7).
+
+    No state holds the blade-passing frequency, so a peak there in an output can only come from
+    these or from the inputs.
+
+    Attributes
+    ----------
+    speed
+        State that holds the rotor speed, in rpm, rad/s or deg/s.
+    angle
+        Channel with the recorded azimuth in deg: it gives the phase in training, and at the start
+        of a simulation. None integrates the recorded speed from zero, which leaves the phase of
+        every run to chance.
+    blades
+        Harmonics are cos(blades ψ) and sin(blades ψ).
+    """
+
+    speed: str
+    angle: str | None = None
+    blades: int = 3
+
+
+@dataclass(frozen=True)
+class SignalTable:
+    """The channels of a model in the order of its vectors, with units.
+
+    Attributes
+    ----------
+    states, controls, disturbances, parameters, outputs
+        One `Channel` per element of ξ, u, w, p and y.
+    specs
+        Which states are measured and which are their rates, see `StateSpec`.
+    derivatives
+        How derivatives were extracted; initial rates of a rollout are found the same way.
+    azimuth
+        Blade-passing harmonics of the output function, if any.
+    """
+
+    states: tuple[Channel, ...]
+    controls: tuple[Channel, ...]
+    disturbances: tuple[Channel, ...]
+    parameters: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    specs: tuple[StateSpec, ...]
+    derivatives: DerivativeSettings
+    azimuth: Azimuth | None = None
+
+    @property
+    def inputs(self) -> tuple[Channel, ...]:
+        """Channels of I = [u, w, ξ, p]."""
+        return (*self.controls, *self.disturbances, *self.states, *self.parameters)
+
+    @property
+    def exogenous(self) -> tuple[str, ...]:
+        """Names of what drives a simulation: controls, disturbances, parameters."""
+        return tuple(c.name for c in (*self.controls, *self.disturbances, *self.parameters))
+
+    def names(self, group: str) -> tuple[str, ...]:
+        """Names of one group, e.g. ``names("states")``."""
+        return tuple(c.name for c in getattr(self, group))
+
+    @property
+    def azimuth_rate(self) -> tuple[int, float] | None:
+        """State that turns the azimuth and the rad/s in one of its units."""
+        if self.azimuth is None:
+            return None
+        names = self.names("states")
+        if self.azimuth.speed not in names:
+            raise DfsmError(
+                f"azimuth.speed is '{self.azimuth.speed}', which is not a state; "
+                + near_matches(self.azimuth.speed, names)
+            )
+        column = names.index(self.azimuth.speed)
+        unit = self.states[column].unit
+        if unit not in _SPEED_UNITS:
+            raise DfsmError(
+                f"azimuth.speed '{self.azimuth.speed}' is in '{unit}', expected one of "
+                f"{', '.join(_SPEED_UNITS)}"
+            )
+        return column, _SPEED_UNITS[unit]
+
+
+class Region(eqx.Module):
+    """Where the training data lie, and what they look like along the schedule.
+
+    Attributes
+    ----------
+    low, high
+        Range of every input over the training runs, shape ``(input,)``.
+    mean, std
+        Over all training samples, shape ``(input,)``.
+    grid
+        Schedule values of the operating points, shape ``(point,)``; one for an LTI model.
+    operating
+        Mean of every input at each, shape ``(point, input)``.
+    """
+
+    low: jax.Array
+    high: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    grid: jax.Array
+    operating: jax.Array
+
+    def outside(self, inputs: ArrayLike) -> jax.Array:
+        """Tell which samples of ``(..., input)`` have any input outside its training range."""
+        slack = 1e-9 * (self.high - self.low)
+        inputs = jnp.asarray(inputs)
+        return jnp.any((inputs < self.low - slack) | (inputs > self.high + slack), axis=-1)
+
+
+class DFSM(eqx.Module):
+    """A derivative function surrogate model.
+
+    Attributes
+    ----------
+    f, g
+        Linear fits of all state derivatives and of all outputs (None without outputs).
+    e, e_g
+        Corrective functions of the derivatives `corrected` and the outputs `corrected_outputs`.
+    region
+        Where the training data lie.
+    corrected, corrected_outputs
+        Row indices that the corrective functions add to.
+    signals
+        Names, units and roles.
+    provenance
+        JSON text: settings, seed, data hashes and fit figures, for the manifest and `summary`.
+    """
+
+    f: LinearModel
+    e: Corrective | None
+    g: LinearModel | None
+    e_g: Corrective | None
+    region: Region
+    corrected: tuple[int, ...] = eqx.field(static=True)
+    corrected_outputs: tuple[int, ...] = eqx.field(static=True)
+    signals: SignalTable = eqx.field(static=True)
+    provenance: str = eqx.field(static=True, default="{}")
+
+    # -- evaluation -----------------------------------------------------------------------------
+
+    def derivative(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> jax.Array:
+        """Evaluate f̂.
+
+        Parameters
+        ----------
+        states, controls, disturbances, parameters
+            Shapes ``(..., n)`` in the order and units of `signals`; leading axes broadcast.
+
+        Returns
+        -------
+        Array
+            State derivatives per second, shape ``(..., state)``.
+        """
+        inputs = self.join(states, controls, disturbances, parameters)
+        return _evaluate(partial(_derivative, self), inputs)
+
+    def output(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+        azimuth: ArrayLike | None = None,
+    ) -> jax.Array:
+        """Evaluate ĝ.
+
+        Parameters
+        ----------
+        states, controls, disturbances, parameters
+            As for `derivative`.
+        azimuth
+            Rotor azimuth ψ in rad, shape ``(...)``, for a model with blade-passing harmonics;
+            None takes the average over a revolution.
+
+        Returns
+        -------
+        Array
+            Outputs, shape ``(..., output)``.
+        """
+        inputs = self.join(states, controls, disturbances, parameters)
+        if self.signals.azimuth is None:
+            return _evaluate(partial(_output, self), inputs)
+        if azimuth is None:
+            harmonics = jnp.zeros((*inputs.shape[:-1], 2))
+        else:
+            harmonics = blade_harmonics(azimuth, self.signals.azimuth.blades)
+        shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
+        parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
+        return _evaluate(partial(_output, self), jnp.concatenate(parts, axis=-1))
+
+    def join(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> jax.Array:
+        """Put the groups together as I = [u, w, ξ, p], shape ``(..., input)``.
+
+        Raises
+        ------
+        DfsmError
+            A group has the wrong number of elements.
+        """
+        parts = []
+        for group, value in (
+            ("controls", controls),
+            ("disturbances", disturbances),
+            ("states", states),
+            ("parameters", parameters),
+        ):
+            array = jnp.asarray(value, dtype=jnp.float64)
+            names = self.signals.names(group)
+            if array.ndim == 0 or array.shape[-1] != len(names):
+                raise DfsmError(
+                    f"{group} have shape {array.shape}, expected the last axis to hold "
+                    f"{len(names)}: {', '.join(names) or 'none'}"
+                )
+            parts.append(array)
+        shape = jnp.broadcast_shapes(*(p.shape[:-1] for p in parts))
+        return jnp.concatenate([jnp.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
+
+    def split(self, inputs: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Take I apart: states, controls, disturbances, parameters."""
+        inputs = jnp.asarray(inputs)
+        s = self.signals
+        ends = np.cumsum([len(s.controls), len(s.disturbances), len(s.states), len(s.parameters)])
+        u, w, x, p = (inputs[..., a:b] for a, b in zip([0, *ends[:-1]], ends, strict=True))
+        return x, u, w, p
+
+    # -- derived models -------------------------------------------------------------------------
+
+    def linear_fit(self) -> DFSM:
+        """Return the model without its corrective functions: f̂_L and ĝ_L."""
+        return DFSM(
+            f=self.f,
+            e=None,
+            g=self.g,
+            e_g=None,
+            region=self.region,
+            corrected=(),
+            corrected_outputs=(),
+            signals=self.signals,
+            provenance=self.provenance,
+        )
+
+    def jacobians(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> tuple[Array, Array, Array, Array]:
+        """Exact Jacobians of f̂ and ĝ at one point, corrective functions included.
+
+        Returns
+        -------
+        tuple of ndarray
+            A ``(state, state)``, B ``(state, control + disturbance)``, C ``(output, state)``,
+            D ``(output, control + disturbance)``, in physical units; harmonics at their mean.
+        """
+        inputs = self.join(states, controls, disturbances, parameters)
+        if inputs.ndim != 1:
+            raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
+        n_uw = len(self.signals.controls) + len(self.signals.disturbances)
+        xs, us = slice(n_uw, n_uw + len(self.signals.states)), slice(0, n_uw)
+        J = np.asarray(_jacobian(partial(_derivative, self), inputs))
+        extra = jnp.zeros(2 if self.signals.azimuth else 0)
+        G = (
+            np.asarray(_jacobian(partial(_output, self), jnp.concatenate([inputs, extra])))
+            if self.g is not None
+            else np.empty((0, len(inputs)))
+        )
+        return J[:, xs], J[:, us], G[:, xs], G[:, us]
+
+    def linearize(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> control.StateSpace:
+        """Linearise at a point to a python-control state-space model with named signals.
+
+        Raises
+        ------
+        DfsmError
+            python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError:
+            raise DfsmError("linearize needs python-control: pip install 'dfsm[control]'") from None
+        A, B, C, D = self.jacobians(states, controls, disturbances, parameters)
+        names = self.signals.names
+        return control.StateSpace(
+            A,
+            B,
+            C,
+            D,
+            states=list(names("states")),
+            inputs=[*names("controls"), *names("disturbances")],
+            outputs=list(names("outputs")),
+        )
+
+    def eigenvalues(self) -> list[tuple[float, Array]]:
+        """Eigenvalues (1/s) of the linear fit's A at every schedule point.
+
+        Returns
+        -------
+        list
+            Pairs of schedule value and complex eigenvalues, most unstable first.
+        """
+        n_uw = len(self.signals.controls) + len(self.signals.disturbances)
+        A = np.asarray(self.f.coefficients)[:, :, n_uw : n_uw + len(self.signals.states)]
+        pairs = []
+        for point, matrix in zip(np.asarray(self.f.grid), A, strict=True):
+            values = np.linalg.eigvals(matrix)
+            pairs.append((float(point), values[np.argsort(-values.real)]))
+        return pairs
+
+    @property
+    def schedule(self) -> str | None:
+        """Name of the scheduling input, None for an LTI model."""
+        column = self.f.schedule
+        return None if column is None else self.signals.inputs[column].name
+
+
+def blade_harmonics(azimuth: ArrayLike, blades: int) -> jax.Array:
+    """Return cos(blades ψ) and sin(blades ψ), shape ``(..., 2)``, for ψ in rad."""
+    angle = blades * jnp.asarray(azimuth)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def _derivative(model: DFSM, inputs: jax.Array) -> jax.Array:
+    return _sum(model.f, model.e, model.corrected, inputs)
+
+
+def _output(model: DFSM, inputs: jax.Array) -> jax.Array:
+    if model.g is None:
+        return jnp.zeros(0)
+    return _sum(model.g, model.e_g, model.corrected_outputs, inputs)
+
+
+def _sum(
+    linear: LinearModel, corrective: Corrective | None, rows: tuple[int, ...], inputs: jax.Array
+) -> jax.Array:
+    value = linear(inputs)
+    return value if corrective is None else value.at[np.array(rows)].add(corrective(inputs))
+
+
+@eqx.filter_jit
+def _evaluate(function: Any, inputs: jax.Array) -> jax.Array:
+    flat = inputs.reshape(-1, inputs.shape[-1])
+    return jax.vmap(function)(flat).reshape(*inputs.shape[:-1], -1)
+
+
+@eqx.filter_jit
+def _jacobian(function: Any, inputs: jax.Array) -> jax.Array:
+    return jax.jacfwd(function)(inputs)

@@ -1,0 +1,217 @@
+"""Tables: CSV, Parquet and MAT files to trajectories, and trajectories to CSV and Parquet.
+
+In Parquet, what a `Channel` knows is kept in the field's metadata (`unit`, `step`, `role`; `scale`
+and `offset` of packed codes) and what a run knows in the schema's (`dfsm.…`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dfsm.errors import DfsmError
+from dfsm.files import write_file
+from dfsm.read.assemble import assemble, existing_file
+from dfsm.trajectory import Channel, Trajectory
+
+# The name, one separator at most, and the unit in brackets at the end.
+HEADER = re.compile(r"(.+?)[_ ]?(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+TIME_NAMES = ("time", "t")
+SECONDS = ("", "s", "sec", "second", "seconds")
+
+
+def read_table(path: str | Path) -> Trajectory:
+    """Read a run from a CSV, Parquet or MAT file.
+
+    * CSV: the first row holds names, with units as ``PtfmPitch [deg]``, ``PtfmPitch (deg)`` or
+      ``PtfmPitch_[deg]``; separated by comma, semicolon or tab; empty cells are NaN.
+    * Parquet: what `write_table` wrote, or any table with a time column or a float index.
+    * MAT (up to v7): a time vector and vectors as long, or `Channels`, `ChanName` and `ChanUnit`
+      as MATLAB's ``ReadFASTbinary`` returns them, at the top or in one struct.
+
+    Time is the first column called ``Time`` or ``t`` in any case (``tout`` too in MAT), in s.
+
+    Returns
+    -------
+    Trajectory
+        Values of shape ``(time, channel)``, in the units of the file.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing, foreign or damaged; there is no time, or not in s; a row is ragged
+        or holds something that is no number (the line is named).
+    """
+    path = existing_file(path)
+    with path.open("rb") as stream:
+        start = stream.read(8)
+    suffix = path.suffix.lower()
+    if suffix in (".parquet", ".pq") or start.startswith(b"PAR1"):
+        from dfsm.read.parquet import read_parquet
+
+        return read_parquet(path)
+    if suffix == ".mat" or start.startswith((b"MATLAB", b"\x89HDF")):
+        from dfsm.read.mat import read_mat
+
+        return read_mat(path)
+    return _read_csv(path)
+
+
+def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = False) -> None:
+    """Write a run to a `.parquet` or `.csv` file.
+
+    Parquet keeps units, roles, quantisation steps, name, wall time and notes exactly; CSV keeps
+    names, units and all digits.
+
+    Parameters
+    ----------
+    trajectory
+        The run.
+    path
+        Where to; its suffix decides the kind.
+    packed
+        Parquet only: store channels that lie on the grid of their quantisation step as 16-bit
+        codes, value = (code - offset) / scale, and an equidistant mesh as start and step. The
+        codes and steps come back exactly; values as exactly as the grid allows (bit for bit where
+        the run was decoded from 16-bit `.outb`).
+
+    Raises
+    ------
+    DfsmError
+        Another suffix, `packed` with CSV, names that the kind cannot hold, or a failed write.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet") or (packed and suffix == ".csv"):
+        kinds = ".parquet (the only kind that can be packed)" if packed else ".parquet or .csv"
+        raise DfsmError(f"{path}: a table is written to {kinds}: choose a name that ends so")
+    for name in trajectory.names:
+        if name.lower() == "time":
+            raise DfsmError(
+                f"{trajectory.where}: a channel called '{name}' cannot be told from the time in a "
+                "table: leave it out or rename it"
+            )
+    if suffix == ".csv":
+        _write_csv(trajectory, path)
+    else:
+        from dfsm.read.parquet import write_parquet
+
+        write_parquet(trajectory, path, packed=packed)
+
+
+def split_header(text: str) -> tuple[str, str]:
+    """Split ``Name [unit]``, ``Name (unit)`` or ``Name_[unit]`` into name and unit ("" if none)."""
+    text = text.strip()
+    match = HEADER.fullmatch(text)
+    if match is None:
+        return text, ""
+    return match[1], (match[2] if match[2] is not None else match[3]).strip()
+
+
+def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TIME_NAMES) -> int:
+    """Return the column that holds the time.
+
+    Raises
+    ------
+    DfsmError
+        There is none, or its unit is not s.
+    """
+    for i, channel in enumerate(channels):
+        if channel.name.lower() in names:
+            if channel.unit.lower() not in SECONDS:
+                raise DfsmError(
+                    f"{path}: its time '{channel.name}' is in '{channel.unit}', expected s: "
+                    "convert it"
+                )
+            return i
+    shown = ", ".join(c.name for c in channels[:12]) + (", …" if len(channels) > 12 else "")
+    raise DfsmError(
+        f"{path}: no time column, expected one called Time, time or t (in s), found: {shown[:400]}"
+    )
+
+
+def _read_csv(path: Path) -> Trajectory:
+    text = _decode(path)
+    first = text.lstrip("\r\n").split("\n", 1)[0]
+    delimiter = max(",;\t", key=first.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+    rows: list[list[str]] = []
+    numbers: list[int] = []
+    try:
+        for row in reader:
+            if row:
+                rows.append(row)
+                numbers.append(reader.line_num)
+    except csv.Error as error:
+        raise DfsmError(f"{path}, line {reader.line_num}: {error}; it is no CSV table") from None
+    if not rows:
+        raise DfsmError(f"{path} holds blank lines only: check that it is the right file")
+    channels = [Channel(*split_header(cell)) for cell in rows[0]]
+    time = time_column(path, channels)
+    for row, number in zip(rows[1:], numbers[1:], strict=True):
+        if len(row) != len(channels):
+            raise DfsmError(
+                f"{path}, line {number}: {len(row)} values, but the header names {len(channels)} "
+                "columns: correct or remove the line"
+            )
+    cells = [[c.strip() or "nan" for c in row] for row in rows[1:]]
+    try:
+        data = np.array(cells, dtype=np.float64).reshape(len(cells), len(channels))
+    except ValueError:
+        raise _bad_cell(path, cells, numbers[1:]) from None
+    keep = [i for i in range(len(channels)) if i != time]
+    return assemble(path, data[:, time], data[:, keep], [channels[i] for i in keep])
+
+
+def _decode(path: Path) -> str:
+    raw = path.read_bytes()
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encodings = ("utf-16",)
+    elif b"\0" in raw:
+        raise DfsmError(f"{path} is a binary file, a CSV table was expected: check the file")
+    else:
+        # What is not UTF-8 comes from a spreadsheet on Windows; there every byte means something.
+        encodings = ("utf-8-sig", "latin-1")
+    for encoding in encodings:
+        try:
+            return raw.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise DfsmError(f"{path} is damaged UTF-16 text: save it as UTF-8")
+
+
+def _bad_cell(path: Path, cells: list[list[str]], numbers: list[int]) -> DfsmError:
+    for row, number in zip(cells, numbers, strict=True):
+        for column, text in enumerate(row, start=1):
+            try:
+                float(text)
+            except ValueError:
+                return DfsmError(
+                    f"{path}, line {number}: {text[:24]!r} in column {column} is no number: "
+                    "correct it, with a point for the decimals"
+                )
+    return DfsmError(f"{path}: its rows make no table of numbers: check the file")
+
+
+def _write_csv(trajectory: Trajectory, path: Path) -> None:
+    header = ["Time [s]"]
+    for channel in trajectory.channels:
+        plain = channel.name if not channel.unit else f"{channel.name} [{channel.unit}]"
+        # A name that itself looks like 'name [unit]' needs an empty unit behind it.
+        if split_header(plain) != (channel.name, channel.unit):
+            plain = f"{channel.name} [{channel.unit}]"
+        if split_header(plain) != (channel.name, channel.unit):
+            raise DfsmError(
+                f"{trajectory.where}: channel '{channel.name}' in '{channel.unit}' cannot be told "
+                "apart into name and unit in a CSV header: write .parquet instead"
+            )
+        header.append(plain)
+    with write_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        table = np.column_stack([trajectory.time, trajectory.values])
+        writer.writerows([f"{v:.17g}" for v in row] for row in table.tolist())

@@ -1,0 +1,315 @@
+"""Time marching of a surrogate: fixed-step RK4, or diffrax's adaptive and stiff solvers.
+
+A rollout is driven by controls, disturbances, parameters and the initial state, nothing else.
+"""
+
+from __future__ import annotations
+
+import enum
+import time as clock
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dfsm.derivatives import differentiate
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.integrate import Rollout, adapt, march, mesh_of
+from dfsm.model import DFSM
+from dfsm.settings import settings
+from dfsm.trajectory import Trajectory
+from dfsm.types import Array
+
+# A rollout ends where a state is this many times its training half-range from the middle.
+_ESCAPE = 10.0
+# Rates at the start are taken from this many seconds of the record before it (or, where the
+# record starts there, just after it): long enough for a derivative, too short to leak a response.
+_HISTORY = 20.0
+_HEAD = 1.0
+
+
+@settings
+class SimulationSettings:
+    """How to march in time.
+
+    Attributes
+    ----------
+    method
+        ``"rk4"``: classical Runge-Kutta with fixed steps. ``"tsit5"``: adaptive explicit
+        (Tsitouras 2011). ``"kvaerno5"``: adaptive, for stiff models (Kværnø 2004).
+    step
+        Largest step of ``"rk4"`` in s; None takes the run's own samples.
+    rtol, atol
+        Tolerances of the adaptive methods; `atol` is relative to each state's training spread.
+    interpolation
+        Inputs between samples: ``"linear"`` or ``"cubic"`` spline.
+    """
+
+    method: Literal["rk4", "tsit5", "kvaerno5"] = "rk4"
+    step: float | None = None
+    rtol: float = 1e-6
+    atol: float = 1e-8
+    interpolation: Literal["linear", "cubic"] = "linear"
+
+
+class Status(enum.Enum):
+    """How a simulation ended; the value says what it means and what to do."""
+
+    COMPLETED = "completed"
+    LEFT_REGION = (
+        "stopped where a state left the training range by a factor of ten: the model is unstable "
+        "there; look at its eigenvalues, or train on runs that cover this case"
+    )
+    NOT_FINITE = (
+        "stopped where a state was no longer finite: use a smaller step or a stiff method, and "
+        "look at the model's eigenvalues"
+    )
+    SOLVER_FAILED = (
+        "the adaptive solver gave up: loosen rtol and atol, use kvaerno5 for a stiff model, or rk4"
+    )
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A rollout.
+
+    Attributes
+    ----------
+    trajectory
+        States and outputs on the run's time mesh, up to where the rollout ended; roles are set.
+    status
+        How it ended.
+    ended
+        Last time in s.
+    reason
+        For a rollout that did not complete, the state that left the range and where; else "".
+    outside
+        Share of the samples with any input outside its training range.
+    wall_time
+        Seconds it took (of the whole batch divided by its runs), without compilation when warm.
+    """
+
+    trajectory: Trajectory
+    status: Status
+    ended: float
+    reason: str
+    outside: float
+    wall_time: float
+
+    @property
+    def message(self) -> str:
+        """One sentence on the outcome."""
+        if self.status is Status.COMPLETED:
+            return f"{self.outside:.1%} of the time outside the training range"
+        return f"{self.reason}; {self.status.value}"
+
+
+@overload
+def simulate(
+    model: DFSM,
+    runs: Trajectory,
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    initial: ArrayLike | None = None,
+    options: SimulationSettings | None = None,
+) -> Simulation: ...
+@overload
+def simulate(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    initial: ArrayLike | None = None,
+    options: SimulationSettings | None = None,
+) -> list[Simulation]: ...
+def simulate(
+    model: DFSM,
+    runs: Trajectory | Sequence[Trajectory],
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    initial: ArrayLike | None = None,
+    options: SimulationSettings | None = None,
+) -> Simulation | list[Simulation]:
+    """Simulate a surrogate with the inputs of one run, or of many at once.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    runs
+        Trajectories that hold the model's controls, disturbances and parameters, and its measured
+        states unless `initial` is given. Samples before `start` serve only to find the initial
+        rates.
+    start, stop
+        Time window in s; None leaves that end open.
+    initial
+        Initial states, shape ``(state,)`` or one row per run; None takes the recorded state at
+        `start`.
+    options
+        Integration method and steps.
+
+    Returns
+    -------
+    Simulation or list of Simulation
+        In the order of `runs`.
+
+    Raises
+    ------
+    DfsmError
+        A channel is missing or not finite, or the window is too short.
+
+    Warns
+    -----
+    DfsmWarning
+        A rollout was outside the training range for part of the time, or ended early.
+    """
+    options = options or SimulationSettings()
+    single = isinstance(runs, Trajectory)
+    batch = [runs] if isinstance(runs, Trajectory) else list(runs)
+    if not batch:
+        raise DfsmError("no runs were given to simulate")
+    names = model.signals.exogenous
+    driven = [r.select(names).window(start, stop).require_finite() for r in batch]
+    starts = [float(d.time[0]) for d in driven]
+    if initial is None:
+        x0 = np.stack(
+            [initial_state(model, r, d.time[0]) for r, d in zip(batch, driven, strict=True)]
+        )
+    else:
+        x0 = np.broadcast_to(
+            np.asarray(initial, dtype=np.float64), (len(batch), len(model.signals.states))
+        )
+    psi0 = np.array(
+        [_initial_azimuth(model, r, d.time[0]) for r, d in zip(batch, driven, strict=True)]
+    )
+    begin = clock.perf_counter()
+    meshes = [mesh_of(d, options.step, options.interpolation) for d in driven]
+    if options.method == "rk4":
+        solved = march(model, meshes, x0, psi0)
+    else:
+        tolerances = (options.rtol, options.atol)
+        solved = [
+            adapt(model, m, x, psi, options.method, tolerances)
+            for m, x, psi in zip(meshes, x0, psi0, strict=True)
+        ]
+    wall = (clock.perf_counter() - begin) / len(batch)
+    results = [
+        _result(model, r, d, rollout, wall)
+        for r, d, rollout in zip(batch, driven, solved, strict=True)
+    ]
+    _warn(results)
+    return results[0] if single else results
+
+
+def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
+    """Recorded state at `start`; rates come from samples up to it, never from the response after.
+
+    Parameters
+    ----------
+    model
+        The surrogate, for its states and its way of taking derivatives.
+    run
+        Holds the measured states.
+    start
+        Time in s. Where the record begins there, the first second of it gives the rates.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(state,)``.
+    """
+    s = model.signals
+    measured = [n for spec in s.specs for n in (spec.name, spec.rate) if n is not None]
+    specs = [replace(spec, acceleration=None) for spec in s.specs]
+    run = run.select(dict.fromkeys(measured))
+    before = (run.time <= start) & (run.time >= start - _HISTORY)
+    if all(spec.order == 1 or spec.rate for spec in specs):
+        index = int(np.argmin(np.abs(run.time - start)))
+        values = dict(zip(run.names, run.values[index], strict=True))
+        order = [values[spec.name] for spec in specs]
+        return np.array(
+            order + [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
+        )
+    if before.sum() >= 20:
+        piece, row = run.window(start - _HISTORY, start), -1
+    else:
+        head = max(start + _HEAD, float(run.time[min(len(run) - 1, 19)]))
+        piece, row = run.window(start, head), 0
+    found = differentiate(piece.require_finite(), specs, s.derivatives)
+    return found.trajectory.select(found.names).values[row]
+
+
+def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
+    azimuth = model.signals.azimuth
+    if azimuth is None or azimuth.angle is None or azimuth.angle not in run:
+        return 0.0
+    return float(np.deg2rad(run[azimuth.angle][int(np.argmin(np.abs(run.time - start)))]))
+
+
+# -- judging the outcome ------------------------------------------------------------------------
+
+
+def _result(
+    model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout, wall: float
+) -> Simulation:
+    s = model.signals
+    n_uw = len(s.controls) + len(s.disturbances)
+    columns = slice(n_uw, n_uw + len(s.states))
+    low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
+    middle, half = (low + high) / 2, (high - low) / 2
+    x = rollout.states
+    finite = np.isfinite(x)
+    escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > _ESCAPE * half)
+    rows = np.flatnonzero(escaped.any(axis=1))
+    # The sample where it left is kept where it is finite: it shows which way the model went.
+    end = int(rows[0]) if len(rows) else len(x)
+    status, reason = Status.COMPLETED, ""
+    if len(rows):
+        column = int(np.flatnonzero(escaped[end])[0])
+        status = Status.LEFT_REGION if finite[end].all() else Status.NOT_FINITE
+        reason = (
+            f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
+            f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
+        )
+    elif not rollout.solved:
+        status, reason = Status.SOLVER_FAILED, f"no solution beyond {driven.time[end - 1]:g} s"
+    end = max(2, end)
+    inputs = model.join(x[:end], *_groups(model, rollout.inputs[:end]))
+    channels = (*s.states, *s.outputs)
+    values = np.concatenate([x[:end], rollout.outputs[:end]], axis=1)
+    return Simulation(
+        trajectory=Trajectory(
+            driven.time[:end], values, channels, name=run.name, source=run.source
+        ),
+        status=status,
+        ended=float(time[-1]),
+        reason=reason,
+        outside=float(np.mean(model.region.outside(inputs))),
+        wall_time=wall,
+    )
+
+
+def _groups(model: DFSM, exogenous: Array) -> tuple[Array, Array, Array]:
+    n_u, n_w = len(model.signals.controls), len(model.signals.disturbances)
+    return exogenous[:, :n_u], exogenous[:, n_u : n_u + n_w], exogenous[:, n_u + n_w :]
+
+
+def _warn(results: Sequence[Simulation]) -> None:
+    ended = [r for r in results if r.status is not Status.COMPLETED]
+    for r in ended:
+        warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=3)
+    outside = [r for r in results if r.status is Status.COMPLETED and r.outside > 0.05]
+    if outside:
+        worst = max(outside, key=lambda r: r.outside)
+        warnings.warn(
+            f"{len(outside)} of {len(results)} rollouts spend more than 5 % of the time outside "
+            f"the training range, {worst.trajectory.name} most ({worst.outside:.1%})",
+            DfsmWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,71 @@
+"""What `describe` tells about a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from dfsm.read import describe, read
+from dfsm.trajectory import Channel, Trajectory
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
+
+
+def test_a_bundled_run():
+    run = read(EXAMPLES / "iea15_2dof_06mps_s09.outb")
+    info = describe(run)
+    assert info.samples == 14001
+    assert (info.start, info.stop) == (0, 700)
+    assert info.interval is not None
+    assert abs(info.interval - 0.05) < 1e-12
+    pitch = next(c for c in info.channels if c.name == "PtfmPitch")
+    assert pitch.unit == "deg"
+    assert pitch.step == run.channel("PtfmPitch").step
+    assert pitch.min == run["PtfmPitch"].min()
+    assert pitch.max == run["PtfmPitch"].max()
+    np.testing.assert_allclose(pitch.mean, np.sum(run["PtfmPitch"]) / 14001)
+    np.testing.assert_allclose(pitch.std, np.sqrt(np.var(run["PtfmPitch"])))
+    # with pitch as the only motion the nacelle turns as the platform does
+    assert info.warnings == ("'NcIMURAys' holds the same data as 'PtfmRAyt'",)
+
+
+def test_constant_nan_duplicate_and_invalid_channels_are_told():
+    t = np.array([0.0, 1.0, 2.5, 3.0])
+    nan = np.array([1, np.nan, 3, np.inf])
+    columns = [t**2, np.full(4, 7.0), nan, t**2, np.full(4, 7.0), np.full(4, np.nan), nan]
+    run = Trajectory(
+        t,
+        np.stack(columns, axis=1),
+        tuple(Channel(n) for n in ("a", "still", "gap", "twin", "still2", "none", "gap2")),
+        notes=("1 channel marked Invalid left out",),
+    )
+    info = describe(run)
+    assert info.warnings == (
+        "'still' is constant (7)",
+        "'gap' has 2 NaN or infinite samples, the first at 1 s",
+        "'twin' holds the same data as 'a'",
+        "'still2' is constant (7)",
+        "'none' has 4 NaN or infinite samples, the first at 0 s",
+        "'gap2' has 2 NaN or infinite samples, the first at 1 s",
+        "'gap2' holds the same data as 'gap'",
+        "1 channel marked Invalid left out",
+    )
+    assert info.interval is None
+    assert (info.min_interval, info.max_interval) == (0.5, 1.5)
+    gap = info.channels[2]
+    assert (gap.min, gap.max, gap.mean, gap.std) == (1, 3, 2, 1)
+
+
+def test_to_dict_is_strict_json():
+    t = np.array([0.0, 1.0, 2.5])
+    run = Trajectory(t, np.array([[np.nan, 1]] * 3), (Channel("none"), Channel("one", "m", 0.5)))
+    plain = describe(run).to_dict()
+    again = json.loads(json.dumps(plain, allow_nan=False))
+    assert again == plain
+    assert again["interval"] == "irregular"
+    assert again["channels"][0]["mean"] is None
+    assert again["channels"][1]["step"] == 0.5
+    run = Trajectory(np.arange(3), np.ones((3, 1)), (Channel("a"),))
+    assert describe(run).to_dict()["interval"] == 1
