@@ -9,7 +9,6 @@ one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -21,132 +20,13 @@ from numpy.typing import ArrayLike
 
 import dfsm.precision  # noqa: F401
 from dfsm.corrective.functions import Corrective
-from dfsm.derivatives import DerivativeSettings, StateSpec
-from dfsm.errors import DfsmError, near_matches
+from dfsm.errors import DfsmError
 from dfsm.linear import LinearModel
-from dfsm.settings import settings
-from dfsm.trajectory import Channel
-from dfsm.types import Array
+from dfsm.signals import Provenance, Region, SignalTable, blade_harmonics
+from dfsm.types import Array, ComplexArray
 
 if TYPE_CHECKING:
     import control
-
-
-# Radians per second in one unit of a rotor or generator speed.
-_SPEED_UNITS = {"rpm": np.pi / 30, "rad/s": 1.0, "deg/s": np.pi / 180}
-
-
-@settings
-class Azimuth:
-    """Blade-passing harmonics of the rotor azimuth ψ = ∫ω dt as inputs of ĝ (Sec. 3.7).
-
-    No state holds the blade-passing frequency, so a peak there in an output can only come from
-    these or from the inputs.
-
-    Attributes
-    ----------
-    speed
-        State that holds the rotor speed, in rpm, rad/s or deg/s.
-    angle
-        Channel with the recorded azimuth in deg: it gives the phase in training, and at the start
-        of a simulation. None integrates the recorded speed from zero, which leaves the phase of
-        every run to chance.
-    blades
-        Harmonics are cos(blades ψ) and sin(blades ψ).
-    """
-
-    speed: str
-    angle: str | None = None
-    blades: int = 3
-
-
-@dataclass(frozen=True)
-class SignalTable:
-    """The channels of a model in the order of its vectors, with units.
-
-    Attributes
-    ----------
-    states, controls, disturbances, parameters, outputs
-        One `Channel` per element of ξ, u, w, p and y.
-    specs
-        Which states are measured and which are their rates, see `StateSpec`.
-    derivatives
-        How derivatives were extracted; initial rates of a rollout are found the same way.
-    azimuth
-        Blade-passing harmonics of the output function, if any.
-    """
-
-    states: tuple[Channel, ...]
-    controls: tuple[Channel, ...]
-    disturbances: tuple[Channel, ...]
-    parameters: tuple[Channel, ...]
-    outputs: tuple[Channel, ...]
-    specs: tuple[StateSpec, ...]
-    derivatives: DerivativeSettings
-    azimuth: Azimuth | None = None
-
-    @property
-    def inputs(self) -> tuple[Channel, ...]:
-        """Channels of I = [u, w, ξ, p]."""
-        return (*self.controls, *self.disturbances, *self.states, *self.parameters)
-
-    @property
-    def exogenous(self) -> tuple[str, ...]:
-        """Names of what drives a simulation: controls, disturbances, parameters."""
-        return tuple(c.name for c in (*self.controls, *self.disturbances, *self.parameters))
-
-    def names(self, group: str) -> tuple[str, ...]:
-        """Names of one group, e.g. ``names("states")``."""
-        return tuple(c.name for c in getattr(self, group))
-
-    @property
-    def azimuth_rate(self) -> tuple[int, float] | None:
-        """State that turns the azimuth and the rad/s in one of its units."""
-        if self.azimuth is None:
-            return None
-        names = self.names("states")
-        if self.azimuth.speed not in names:
-            raise DfsmError(
-                f"azimuth.speed is '{self.azimuth.speed}', which is not a state; "
-                + near_matches(self.azimuth.speed, names)
-            )
-        column = names.index(self.azimuth.speed)
-        unit = self.states[column].unit
-        if unit not in _SPEED_UNITS:
-            raise DfsmError(
-                f"azimuth.speed '{self.azimuth.speed}' is in '{unit}', expected one of "
-                f"{', '.join(_SPEED_UNITS)}"
-            )
-        return column, _SPEED_UNITS[unit]
-
-
-class Region(eqx.Module):
-    """Where the training data lie, and what they look like along the schedule.
-
-    Attributes
-    ----------
-    low, high
-        Range of every input over the training runs, shape ``(input,)``.
-    mean, std
-        Over all training samples, shape ``(input,)``.
-    grid
-        Schedule values of the operating points, shape ``(point,)``; one for an LTI model.
-    operating
-        Mean of every input at each, shape ``(point, input)``.
-    """
-
-    low: jax.Array
-    high: jax.Array
-    mean: jax.Array
-    std: jax.Array
-    grid: jax.Array
-    operating: jax.Array
-
-    def outside(self, inputs: ArrayLike) -> jax.Array:
-        """Tell which samples of ``(..., input)`` have any input outside its training range."""
-        slack = 1e-9 * (self.high - self.low)
-        inputs = jnp.asarray(inputs)
-        return jnp.any((inputs < self.low - slack) | (inputs > self.high + slack), axis=-1)
 
 
 class DFSM(eqx.Module):
@@ -165,7 +45,7 @@ class DFSM(eqx.Module):
     signals
         Names, units and roles.
     provenance
-        JSON text: settings, seed, data hashes and fit figures, for the manifest and `summary`.
+        Where the model comes from; see `Provenance`.
     """
 
     f: LinearModel
@@ -176,7 +56,7 @@ class DFSM(eqx.Module):
     corrected: tuple[int, ...] = eqx.field(static=True)
     corrected_outputs: tuple[int, ...] = eqx.field(static=True)
     signals: SignalTable = eqx.field(static=True)
-    provenance: str = eqx.field(static=True, default="{}")
+    provenance: Provenance = eqx.field(static=True, default_factory=Provenance)
 
     # -- evaluation -----------------------------------------------------------------------------
 
@@ -351,7 +231,7 @@ class DFSM(eqx.Module):
             outputs=list(names("outputs")),
         )
 
-    def eigenvalues(self) -> list[tuple[float, Array]]:
+    def eigenvalues(self) -> list[tuple[float, ComplexArray]]:
         """Eigenvalues (1/s) of the linear fit's A at every schedule point.
 
         Returns
@@ -363,9 +243,30 @@ class DFSM(eqx.Module):
         A = np.asarray(self.f.coefficients)[:, :, n_uw : n_uw + len(self.signals.states)]
         pairs = []
         for point, matrix in zip(np.asarray(self.f.grid), A, strict=True):
-            values = np.linalg.eigvals(matrix)
+            values = np.linalg.eigvals(matrix).astype(np.complex128)
             pairs.append((float(point), values[np.argsort(-values.real)]))
         return pairs
+
+    def summary(self) -> str:
+        """Describe the model: signals, which rows are corrected and why, stability, warnings."""
+        s, record = self.signals, self.provenance.record
+        lines = [
+            f"{group}: {', '.join(c.label for c in getattr(s, group))}"
+            for group in ("states", "controls", "disturbances", "parameters", "outputs")
+            if getattr(s, group)
+        ]
+        kind = f"LPV in {self.schedule}, {len(self.f.grid)} points" if self.schedule else "LTI"
+        lines.append(f"linear fit: {kind}, condition number {record.get('condition', np.nan):.3g}")
+        for row in record.get("rows", []):
+            lines.append(f"  {row['name']} ({row['unit']}): {row['decision']}")
+        for point, values in self.eigenvalues():
+            where = f"{self.schedule} = {point:.4g}" if self.schedule else "A"
+            listed = ", ".join(_complex(v) for v in values if v.imag >= 0)
+            unstable = "  UNSTABLE" if values.real.max() > 0 else ""
+            lines.append(f"  eigenvalues (1/s) at {where}: {listed}{unstable}")
+        lines += [f"check: {text}" for text in record.get("checks", [])]
+        lines += [f"warning: {text}" for text in record.get("warnings", [])]
+        return "\n".join(lines)
 
     @property
     def schedule(self) -> str | None:
@@ -374,10 +275,8 @@ class DFSM(eqx.Module):
         return None if column is None else self.signals.inputs[column].name
 
 
-def blade_harmonics(azimuth: ArrayLike, blades: int) -> jax.Array:
-    """Return cos(blades ψ) and sin(blades ψ), shape ``(..., 2)``, for ψ in rad."""
-    angle = blades * jnp.asarray(azimuth)
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+def _complex(value: complex) -> str:
+    return f"{value.real:.3g}" + (f" ± {value.imag:.3g}i" if value.imag else "")
 
 
 def _derivative(model: DFSM, inputs: jax.Array) -> jax.Array:

@@ -178,16 +178,11 @@ def simulate(
     driven = [r.select(names).window(start, stop).require_finite() for r in batch]
     starts = [float(d.time[0]) for d in driven]
     if initial is None:
-        x0 = np.stack(
-            [initial_state(model, r, d.time[0]) for r, d in zip(batch, driven, strict=True)]
-        )
+        x0 = np.stack([initial_state(model, r, t) for r, t in zip(batch, starts, strict=True)])
     else:
-        x0 = np.broadcast_to(
-            np.asarray(initial, dtype=np.float64), (len(batch), len(model.signals.states))
-        )
-    psi0 = np.array(
-        [_initial_azimuth(model, r, d.time[0]) for r, d in zip(batch, driven, strict=True)]
-    )
+        shape = (len(batch), len(model.signals.states))
+        x0 = np.broadcast_to(np.asarray(initial, dtype=np.float64), shape)
+    psi0 = np.array([_initial_azimuth(model, r, t) for r, t in zip(batch, starts, strict=True)])
     begin = clock.perf_counter()
     meshes = [mesh_of(d, options.step, options.interpolation) for d in driven]
     if options.method == "rk4":
@@ -232,10 +227,8 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     if all(spec.order == 1 or spec.rate for spec in specs):
         index = int(np.argmin(np.abs(run.time - start)))
         values = dict(zip(run.names, run.values[index], strict=True))
-        order = [values[spec.name] for spec in specs]
-        return np.array(
-            order + [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
-        )
+        rates = [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
+        return np.array([values[spec.name] for spec in specs] + rates)
     if before.sum() >= 20:
         piece, row = run.window(start - _HISTORY, start), -1
     else:
@@ -283,10 +276,9 @@ def _result(
     inputs = model.join(x[:end], *_groups(model, rollout.inputs[:end]))
     channels = (*s.states, *s.outputs)
     values = np.concatenate([x[:end], rollout.outputs[:end]], axis=1)
+    time = driven.time[:end]
     return Simulation(
-        trajectory=Trajectory(
-            driven.time[:end], values, channels, name=run.name, source=run.source
-        ),
+        trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
         status=status,
         ended=float(time[-1]),
         reason=reason,

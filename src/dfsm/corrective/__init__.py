@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dfsm.corrective.functions import Corrective, GaussianUnits, Perceptron
 from dfsm.corrective.gaussian_process import GP, fit_gp
 from dfsm.corrective.perceptron import MLP, fit_mlp

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import dfsm.precision  # noqa: F401
 
@@ -34,6 +37,13 @@ class GaussianUnits(eqx.Module):
         squared = jnp.sum((self.centres - z) ** 2, axis=1)
         return jnp.exp(-squared) @ self.weights + self.bias
 
+    def select(self, rows: Sequence[int]) -> GaussianUnits:
+        """Keep some of the targets."""
+        keep = np.array(rows)
+        return GaussianUnits(
+            self.shift, self.scale, self.centres, self.weights[:, keep], self.bias[keep]
+        )
+
 
 class Perceptron(eqx.Module):
     """Fully connected tanh network on standardised inputs, linear output layer.
@@ -57,6 +67,16 @@ class Perceptron(eqx.Module):
         for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
             z = jnp.tanh(W @ z + b)
         return self.weights[-1] @ z + self.biases[-1]
+
+    def select(self, rows: Sequence[int]) -> Perceptron:
+        """Keep some of the targets."""
+        keep = np.array(rows)
+        return Perceptron(
+            self.shift,
+            self.scale,
+            (*self.weights[:-1], self.weights[-1][keep]),
+            (*self.biases[:-1], self.biases[-1][keep]),
+        )
 
 
 Corrective = GaussianUnits | Perceptron

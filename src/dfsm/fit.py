@@ -1,0 +1,360 @@
+"""The method, step by step: runs in, a multi-fidelity DFSM out (Sec. 3.1).
+
+Read `fit` from top to bottom: select the channels, take derivatives, fit linearly, look at what is
+left, correct where that is worth it, do the same for the outputs, check the result.
+"""
+
+from __future__ import annotations
+
+import time as clock
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.corrective import Corrective, NoCorrection, fit_corrective
+from dfsm.derivatives import kinematic_rows
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
+from dfsm.model import DFSM
+from dfsm.read.openfast import wind_warning
+from dfsm.samples import FitSettings, Samples, extract, select
+from dfsm.signals import Provenance, Region, SignalTable
+from dfsm.simulate import Status, simulate
+from dfsm.trajectory import Dataset, Trajectory
+from dfsm.types import Array
+
+# Operating points along the schedule: means of the inputs over equally filled bins.
+_OPERATING_POINTS = 12
+# Training runs that are simulated to check a new model.
+_CHECK_RUNS = 8
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What `fit` returns.
+
+    Attributes
+    ----------
+    model
+        The multi-fidelity model; ``model.linear_fit()`` is its linear part alone.
+    nonlinear
+        The nonlinear-only model f̂_NL, if asked for.
+    seconds
+        Wall time per step.
+    """
+
+    model: DFSM
+    nonlinear: DFSM | None
+    seconds: Mapping[str, float]
+
+
+def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
+    """Fit a multi-fidelity derivative function surrogate model.
+
+    Parameters
+    ----------
+    runs
+        Simulations that hold all channels named in `choices`; their order does not matter.
+    choices
+        Signals and settings.
+
+    Returns
+    -------
+    FitResult
+
+    Raises
+    ------
+    DfsmError
+        Bad data or settings, in one sentence.
+
+    Warns
+    -----
+    DfsmWarning
+        Inputs that the data cannot tell apart, an unstable linear fit, a disturbance that holds
+        a response.
+    """
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "select"):
+        data = select(runs, choices)
+    with _timed(seconds, "derivatives"):
+        samples = extract(data, choices)
+    with _timed(seconds, "linear fit"):
+        f = _fit_derivatives(samples, choices)
+        g = _fit_outputs(samples, choices)
+    with _timed(seconds, "corrective functions"):
+        e = _correct(samples, samples.inputs, samples.derivatives, f, choices)
+        e_g = _correct(samples, _output_inputs(samples), samples.outputs, g, choices) if g else None
+    model = DFSM(
+        f=f.model,
+        e=e.function,
+        g=g.model if g else None,
+        e_g=e_g.function if e_g else None,
+        region=_region(samples, f.model),
+        corrected=e.rows,
+        corrected_outputs=e_g.rows if e_g else (),
+        signals=samples.signals,
+    )
+    with _timed(seconds, "checks"):
+        notes, checks = _check(model, samples, data, choices)
+    notes = [*f.warnings, *(g.warnings if g else ()), *notes]
+    nonlinear = None
+    if choices.nonlinear_only and not isinstance(choices.corrective, NoCorrection):
+        with _timed(seconds, "nonlinear-only"):
+            nonlinear = _fit_nonlinear(samples, model.region, choices)
+    decisions = [*e.decisions, *(e_g.decisions if e_g else [])]
+    record = _record(data, choices, f, decisions, notes, checks, seconds)
+    for text in notes:
+        warnings.warn(text, DfsmWarning, stacklevel=2)
+    model = replace(model, provenance=Provenance(record))
+    if nonlinear is not None:
+        nonlinear = replace(nonlinear, provenance=Provenance(record))
+    return FitResult(model, nonlinear, seconds)
+
+
+# -- linear fit (Sec. 3.4) ----------------------------------------------------------------------
+
+
+def _fit_derivatives(samples: Samples, choices: FitSettings) -> LinearFit:
+    """Linear fit of ξ̇; kinematic rows d q = q̇ are written down, not fitted."""
+    known = kinematic_rows(choices.states)
+    fitted = [i for i in range(samples.derivatives.shape[1]) if i not in known]
+    result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], choices)
+    n_uw = len(choices.controls) + len(choices.disturbances)
+    points, _, n_inputs = result.model.coefficients.shape
+    L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
+    b = np.zeros(L.shape[:2])
+    L[:, fitted], b[:, fitted] = result.model.coefficients, result.model.offsets
+    rms, std = np.zeros(L.shape[1]), samples.derivatives.std(axis=0)
+    rms[fitted] = result.residual_rms
+    for row, rate in known.items():
+        L[:, row, n_uw + rate] = 1.0
+    model = LinearModel(result.model.grid, jnp.asarray(L), jnp.asarray(b), result.model.schedule)
+    return replace(result, model=model, residual_rms=rms, target_std=std)
+
+
+def _fit_outputs(samples: Samples, choices: FitSettings) -> LinearFit | None:
+    if not choices.outputs:
+        return None
+    return _linear(samples, _output_inputs(samples), samples.outputs, choices)
+
+
+def _output_inputs(samples: Samples) -> Array:
+    return np.concatenate([samples.inputs, samples.harmonics], axis=1)
+
+
+def _linear(samples: Samples, inputs: Array, targets: Array, choices: FitSettings) -> LinearFit:
+    names = [c.name for c in samples.signals.inputs]
+    names += ["cos(blades ψ)", "sin(blades ψ)"][: inputs.shape[1] - len(names)]
+    windows = None
+    if isinstance(choices.linear, LPV):
+        if choices.linear.schedule not in names:
+            raise DfsmError(
+                f"linear.schedule '{choices.linear.schedule}' is not an input of the model: "
+                f"choose one of {', '.join(names)}"
+            )
+        column = names.index(choices.linear.schedule)
+        windows = schedule_windows(inputs[:, column], choices.linear.points)
+    return fit_linear(samples.blocks(inputs, targets), names, choices.linear, windows)
+
+
+# -- corrective functions (Sec. 3.5, 3.6) -------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Correction:
+    function: Corrective | None
+    rows: tuple[int, ...]
+    decisions: list[dict[str, Any]]
+
+
+def _correct(
+    samples: Samples, inputs: Array, targets: Array, linear: LinearFit, choices: FitSettings
+) -> _Correction:
+    """Train a corrective function for the rows whose residual is large, and say which and why."""
+    residuals = targets - _predict(linear.model, samples, inputs, targets)
+    rms, std = np.sqrt(np.mean(residuals**2, axis=0)), targets.std(axis=0)
+    ratio = rms / np.maximum(std, np.finfo(float).tiny)
+    derivatives = targets is samples.derivatives
+    known = kinematic_rows(choices.states) if derivatives else {}
+    large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > choices.gate]
+    function, explained, detail = None, dict[int, float](), ""
+    if large and not isinstance(choices.corrective, NoCorrection):
+        trained = fit_corrective(
+            inputs, residuals[:, large], samples.runs, choices.corrective, choices.seed
+        )
+        explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
+        # A correction that does no good on runs left out of training would only do harm.
+        kept = [k for k, share in enumerate(trained.explained) if share > 0]
+        function = trained.function.select(kept) if kept else None
+        large = [large[k] for k in kept]
+    else:
+        large = []
+    decisions = []
+    for i, (name, unit) in enumerate(_target_names(samples.signals, derivatives)):
+        if i in known:
+            text = "kinematic, its rate is a state"
+        elif ratio[i] <= choices.gate:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal (gate {choices.gate:.1%})"
+        elif i in large:
+            text = (
+                f"corrected, residual {ratio[i]:.1%} of the signal, of whose variance "
+                f"{explained[i]:.1%} is explained on left-out runs ({detail})"
+            )
+        elif i in explained:
+            text = f"linear fit, residual {ratio[i]:.1%}: a correction did not help left-out runs"
+        else:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
+        decisions.append(
+            {
+                "name": name,
+                "unit": unit,
+                "std": float(std[i]),
+                "residual_rms": float(rms[i]),
+                "explained": float(explained[i]) if i in explained else None,
+                "corrected": i in large,
+                "decision": text,
+            }
+        )
+    return _Correction(function, tuple(large), decisions)
+
+
+def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """Evaluate the linear fit run by run, so that memory stays bounded."""
+    parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
+    return np.concatenate([np.asarray(p) for p in parts])
+
+
+@eqx.filter_jit
+def _apply(model: Any, inputs: Array) -> jax.Array:
+    return jax.vmap(model)(jnp.asarray(inputs))
+
+
+def _target_names(signals: SignalTable, derivatives: bool) -> list[tuple[str, str]]:
+    if not derivatives:
+        return [(c.name, c.unit) for c in signals.outputs]
+    return [(f"d/dt {c.name}", f"{c.unit}/s") for c in signals.states]
+
+
+def _fit_nonlinear(samples: Samples, region: Region, choices: FitSettings) -> DFSM:
+    """f̂_NL: the same corrective function for every row, and nothing linear under it."""
+
+    def part(inputs: Array, targets: Array) -> tuple[LinearModel, Corrective | None]:
+        if not targets.shape[1] or isinstance(choices.corrective, NoCorrection):
+            raise ValueError("nothing to fit")
+        mean = targets.mean(axis=0)
+        trained = fit_corrective(
+            inputs, targets - mean, samples.runs, choices.corrective, choices.seed
+        )
+        zero = jnp.zeros((1, targets.shape[1], inputs.shape[1]))
+        return LinearModel(jnp.zeros(1), zero, jnp.asarray(mean)[None], None), trained.function
+
+    f, e = part(samples.inputs, samples.derivatives)
+    g, e_g = part(_output_inputs(samples), samples.outputs) if choices.outputs else (None, None)
+    return DFSM(
+        f=f,
+        e=e,
+        g=g,
+        e_g=e_g,
+        region=region,
+        corrected=tuple(range(samples.derivatives.shape[1])),
+        corrected_outputs=tuple(range(samples.outputs.shape[1])),
+        signals=samples.signals,
+    )
+
+
+# -- what is handed over ------------------------------------------------------------------------
+
+
+def _region(samples: Samples, model: LinearModel) -> Region:
+    inputs = samples.inputs
+    if model.schedule is None:
+        grid, operating = inputs.mean(axis=0)[:1], inputs.mean(axis=0)[None]
+    else:
+        order = np.argsort(inputs[:, model.schedule], kind="stable")
+        bins = np.array_split(order, _OPERATING_POINTS)
+        operating = np.stack([inputs[rows].mean(axis=0) for rows in bins])
+        grid = operating[:, model.schedule]
+    return Region(
+        low=jnp.asarray(inputs.min(axis=0)),
+        high=jnp.asarray(inputs.max(axis=0)),
+        mean=jnp.asarray(inputs.mean(axis=0)),
+        std=jnp.asarray(inputs.std(axis=0)),
+        grid=jnp.asarray(grid),
+        operating=jnp.asarray(operating),
+    )
+
+
+def _check(
+    model: DFSM, samples: Samples, data: Dataset, choices: FitSettings
+) -> tuple[list[str], list[str]]:
+    """Look for what would surprise a user: non-finite values, instability, leaking disturbances."""
+    notes = [text for name in choices.disturbances if (text := wind_warning(name))]
+    x, u, w, p = model.split(samples.inputs)
+    values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
+    if not np.isfinite(values).all():
+        raise DfsmError(
+            "the fitted model is not finite on its own training samples: fewer "
+            "corrective.samples, or another corrective.kind, may cure it"
+        )
+    unstable = [(s, v.real.max()) for s, v in model.eigenvalues() if v.real.max() > 0]
+    if unstable:
+        points = ", ".join(f"{s:.4g}" for s, _ in unstable)
+        where = f"{model.schedule} = {points}" if model.schedule else "its only point"
+        notes.append(
+            f"the linear fit is unstable at {where} (fastest growth "
+            f"{max(v for _, v in unstable):.3g} 1/s): right for an unstable system, otherwise "
+            "expect rollouts to drift off"
+        )
+    some = [data[i] for i in np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        rollouts = simulate(model, some, start=choices.start, stop=choices.stop)
+    done = sum(r.status is Status.COMPLETED for r in rollouts)
+    checks = [f"{done} of {len(some)} training runs tried simulate to their end"]
+    if done < len(some):
+        worst = min(
+            (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended
+        )
+        notes.append(f"only {checks[0]}; {worst.trajectory.name}: {worst.reason}")
+    return notes, checks
+
+
+def _record(
+    data: Dataset,
+    choices: FitSettings,
+    f: LinearFit,
+    decisions: list[dict[str, Any]],
+    notes: list[str],
+    checks: list[str],
+    seconds: Mapping[str, float],
+) -> dict[str, Any]:
+    return {
+        "settings": asdict(choices),
+        "data": [
+            {"name": r.name, "samples": len(r), "sha256": r.digest, "seconds": r.duration}
+            for r in data
+        ],
+        "rows": decisions,
+        "condition": f.condition,
+        "schedule_windows": f.windows.tolist(),
+        "window_samples": f.samples.tolist(),
+        "checks": checks,
+        "warnings": notes,
+        "versions": {name: version(name) for name in ("dfsm", "jax", "numpy", "scipy")},
+        "seconds": dict(seconds),
+    }
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+    begin = clock.perf_counter()
+    yield
+    seconds[step] = clock.perf_counter() - begin

@@ -1,0 +1,199 @@
+"""From runs to training samples: choose the channels, take the derivatives (Sec. 3.2, 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from dfsm.corrective import RBF, CorrectiveChoice
+from dfsm.derivatives import DerivativeSettings, StateSpec, differentiate, state_names
+from dfsm.errors import DfsmError
+from dfsm.linear import LPV, LTI
+from dfsm.progress import track
+from dfsm.settings import settings
+from dfsm.signals import Azimuth, SignalTable, blade_harmonics, radians_per_second
+from dfsm.trajectory import Channel, Dataset, Role, Trajectory
+from dfsm.types import Array, IntArray
+
+
+@settings
+class FitSettings:
+    """Everything that defines a fit besides the data.
+
+    Attributes
+    ----------
+    states
+        What is a state, and of which order, see `StateSpec`.
+    controls, disturbances, parameters, outputs
+        Channel names by role. Disturbances are known signals that nobody chooses; none of them
+        may hold a response of the system.
+    start, stop
+        Time window in s used for training; derivatives are taken on the whole run before.
+    derivatives
+        How derivatives are extracted.
+    linear
+        `LTI`, or `LPV` in one of the disturbances (or other inputs).
+    corrective
+        Kind and settings of the corrective functions; None leaves the linear fit alone.
+    gate
+        A row is corrected only where the RMS of its residual exceeds this share of the signal's
+        standard deviation.
+    azimuth
+        Blade-passing harmonics for the outputs.
+    nonlinear_only
+        Also fit f̂_NL, the same corrective function without a linear part, for comparison.
+    seed
+        Seed of everything random.
+    """
+
+    states: tuple[StateSpec, ...]
+    controls: tuple[str, ...] = ()
+    disturbances: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    start: float | None = None
+    stop: float | None = None
+    derivatives: DerivativeSettings = field(default_factory=DerivativeSettings)
+    linear: LTI | LPV = field(default_factory=LTI)
+    corrective: CorrectiveChoice = field(default_factory=RBF)
+    gate: float = 0.02
+    azimuth: Azimuth | None = None
+    nonlinear_only: bool = True
+    seed: int = 0
+
+    @property
+    def roles(self) -> dict[str, Role]:
+        """Role of every channel that the fit reads."""
+        roles: dict[str, Role] = {}
+        groups: tuple[tuple[Role, Iterable[str]], ...] = (
+            ("state", [n for s in self.states for n in (s.name, s.rate, s.acceleration) if n]),
+            ("control", self.controls),
+            ("disturbance", self.disturbances),
+            ("parameter", self.parameters),
+            ("output", self.outputs),
+        )
+        for role, names in groups:
+            for name in names:
+                if roles.get(name, role) != role and "output" not in (role, roles[name]):
+                    raise DfsmError(
+                        f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
+                    )
+                roles.setdefault(name, role)
+        return roles
+
+
+@dataclass(frozen=True)
+class Samples:
+    """All training samples, stacked over runs (Sec. 3.2).
+
+    Attributes
+    ----------
+    inputs, derivatives, outputs, harmonics
+        I, Ẋ, Y and the blade-passing harmonics, shapes ``(sample, n)``.
+    runs
+        Run index of each sample, shape ``(sample,)``.
+    signals
+        What the columns mean.
+    """
+
+    inputs: Array
+    derivatives: Array
+    outputs: Array
+    harmonics: Array
+    runs: IntArray
+    signals: SignalTable
+
+    def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
+        """Samples run by run."""
+        ends = np.flatnonzero(np.diff(self.runs, append=-1)) + 1
+        for start, stop in zip([0, *ends[:-1]], ends, strict=True):
+            yield inputs[start:stop], targets[start:stop]
+
+
+def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
+    """Keep the channels that the fit reads, check them, and put the runs in their order."""
+    roles = choices.roles
+    state_names(choices.states)
+    names = dict.fromkeys(roles)
+    if choices.azimuth is not None and choices.azimuth.angle is not None:
+        names[choices.azimuth.angle] = None
+    picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
+    for run in picked:
+        run.window(choices.start, choices.stop)
+    data = Dataset(picked)
+    for name in names:
+        data.channel(name)
+    for name in (*choices.controls, *choices.disturbances):
+        windows = [r.window(choices.start, choices.stop)[name] for r in data]
+        low, high = min(w.min() for w in windows), max(w.max() for w in windows)
+        if low == high:
+            raise DfsmError(
+                f"{roles[name]} '{name}' is {low:g} throughout all {len(data)} runs, so nothing "
+                f"can be learned about its effect: leave it out of {roles[name]}s, or add runs "
+                "in which it varies"
+            )
+    return data
+
+
+def extract(data: Dataset, choices: FitSettings) -> Samples:
+    """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
+    parts: list[list[Array]] = []
+    for run in track(data, "derivatives"):
+        found = differentiate(run, choices.states, choices.derivatives)
+        whole = found.trajectory
+        inside = whole.window(choices.start, choices.stop)
+        rows = (whole.time >= inside.time[0]) & (whole.time <= inside.time[-1])
+        names = (*choices.controls, *choices.disturbances, *found.names, *choices.parameters)
+        parts.append(
+            [
+                inside.select(names).values,
+                found.derivatives[rows],
+                run.select(choices.outputs).values[rows],
+                _harmonics(run, choices.azimuth)[rows],
+            ]
+        )
+    lengths = [len(p[0]) for p in parts]
+    inputs, derivatives, outputs, harmonics = (np.concatenate(c) for c in zip(*parts, strict=True))
+    return Samples(
+        inputs=inputs,
+        derivatives=derivatives,
+        outputs=outputs,
+        harmonics=harmonics,
+        runs=np.repeat(np.arange(len(data)), lengths),
+        signals=_signals(data, choices),
+    )
+
+
+def _signals(data: Dataset, choices: FitSettings) -> SignalTable:
+    # The first run stands for all: `select` has made sure that units agree.
+    found = differentiate(data[0], choices.states, choices.derivatives).trajectory
+
+    def channels(names: Iterable[str], role: Role) -> tuple[Channel, ...]:
+        return tuple(Channel(n, found.channel(n).unit, role=role) for n in names)
+
+    table = SignalTable(
+        states=channels(state_names(choices.states), "state"),
+        controls=channels(choices.controls, "control"),
+        disturbances=channels(choices.disturbances, "disturbance"),
+        parameters=channels(choices.parameters, "parameter"),
+        outputs=channels(choices.outputs, "output"),
+        specs=tuple(choices.states),
+        derivatives=choices.derivatives,
+        azimuth=choices.azimuth,
+    )
+    _ = table.azimuth_rate  # fails here, not in the middle of a simulation
+    return table
+
+
+def _harmonics(run: Trajectory, azimuth: Azimuth | None) -> Array:
+    if azimuth is None:
+        return np.empty((len(run), 0))
+    if azimuth.angle is not None:
+        psi = np.deg2rad(run[azimuth.angle])
+    else:
+        omega = run[azimuth.speed] * radians_per_second(run.channel(azimuth.speed))
+        psi = cumulative_trapezoid(omega, run.time, initial=0.0)
+    return np.asarray(blade_harmonics(psi, azimuth.blades))

@@ -1,0 +1,173 @@
+"""What the vectors of a model mean: names, units, roles, training region, blade harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+import dfsm.precision  # noqa: F401
+from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.errors import DfsmError, near_matches
+from dfsm.settings import settings
+from dfsm.trajectory import Channel
+
+# Radians per second in one unit of a rotor or generator speed.
+_SPEED_UNITS = {"rpm": np.pi / 30, "rad/s": 1.0, "deg/s": np.pi / 180}
+
+
+@settings
+class Azimuth:
+    """Blade-passing harmonics of the rotor azimuth ψ = ∫ω dt as inputs of ĝ (Sec. 3.7).
+
+    No state holds the blade-passing frequency, so a peak there in an output can only come from
+    these or from the inputs.
+
+    Attributes
+    ----------
+    speed
+        State that holds the rotor speed, in rpm, rad/s or deg/s.
+    angle
+        Channel with the recorded azimuth in deg: it gives the phase in training, and at the start
+        of a simulation. None integrates the recorded speed from zero, which leaves the phase of
+        every run to chance.
+    blades
+        Harmonics are cos(blades ψ) and sin(blades ψ).
+    """
+
+    speed: str
+    angle: str | None = None
+    blades: int = 3
+
+
+@dataclass(frozen=True)
+class SignalTable:
+    """The channels of a model in the order of its vectors, with units.
+
+    Attributes
+    ----------
+    states, controls, disturbances, parameters, outputs
+        One `Channel` per element of ξ, u, w, p and y.
+    specs
+        Which states are measured and which are their rates, see `StateSpec`.
+    derivatives
+        How derivatives were extracted; initial rates of a rollout are found the same way.
+    azimuth
+        Blade-passing harmonics of the output function, if any.
+    """
+
+    states: tuple[Channel, ...]
+    controls: tuple[Channel, ...]
+    disturbances: tuple[Channel, ...]
+    parameters: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    specs: tuple[StateSpec, ...]
+    derivatives: DerivativeSettings = field(hash=False)
+    azimuth: Azimuth | None = None
+
+    @property
+    def inputs(self) -> tuple[Channel, ...]:
+        """Channels of I = [u, w, ξ, p]."""
+        return (*self.controls, *self.disturbances, *self.states, *self.parameters)
+
+    @property
+    def exogenous(self) -> tuple[str, ...]:
+        """Names of what drives a simulation: controls, disturbances, parameters."""
+        return tuple(c.name for c in (*self.controls, *self.disturbances, *self.parameters))
+
+    def names(self, group: str) -> tuple[str, ...]:
+        """Names of one group, e.g. ``names("states")``."""
+        return tuple(c.name for c in getattr(self, group))
+
+    @property
+    def azimuth_rate(self) -> tuple[int, float] | None:
+        """State that turns the azimuth and the rad/s in one of its units."""
+        if self.azimuth is None:
+            return None
+        names = self.names("states")
+        if self.azimuth.speed not in names:
+            raise DfsmError(
+                f"azimuth.speed is '{self.azimuth.speed}', which is not a state; "
+                + near_matches(self.azimuth.speed, names)
+            )
+        column = names.index(self.azimuth.speed)
+        return column, radians_per_second(self.states[column])
+
+
+def radians_per_second(speed: Channel) -> float:
+    """The rad/s in one unit of a speed channel.
+
+    Raises
+    ------
+    DfsmError
+        The unit is not one of a rotational speed.
+    """
+    if speed.unit not in _SPEED_UNITS:
+        raise DfsmError(
+            f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of "
+            f"{', '.join(_SPEED_UNITS)}"
+        )
+    return _SPEED_UNITS[speed.unit]
+
+
+class Region(eqx.Module):
+    """Where the training data lie, and what they look like along the schedule.
+
+    Attributes
+    ----------
+    low, high
+        Range of every input over the training runs, shape ``(input,)``.
+    mean, std
+        Over all training samples, shape ``(input,)``.
+    grid
+        Schedule values of the operating points, shape ``(point,)``; one for an LTI model.
+    operating
+        Mean of every input at each, shape ``(point, input)``.
+    """
+
+    low: jax.Array
+    high: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    grid: jax.Array
+    operating: jax.Array
+
+    def outside(self, inputs: ArrayLike) -> jax.Array:
+        """Tell which samples of ``(..., input)`` have any input outside its training range."""
+        slack = 1e-9 * (self.high - self.low)
+        inputs = jnp.asarray(inputs)
+        return jnp.any((inputs < self.low - slack) | (inputs > self.high + slack), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """Where a model comes from: settings, data, figures of the fit; all of it JSON values.
+
+    It never enters compiled code. All instances compare equal, so that models which differ only
+    in their history share a compilation.
+
+    Attributes
+    ----------
+    record
+        Keys ``settings``, ``data``, ``rows``, ``warnings``, ``versions``, ``seconds``, ….
+    """
+
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Provenance)
+
+    def __hash__(self) -> int:
+        return hash(Provenance)
+
+
+def blade_harmonics(azimuth: ArrayLike, blades: int) -> jax.Array:
+    """Return cos(blades ψ) and sin(blades ψ), shape ``(..., 2)``, for ψ in rad."""
+    angle = blades * jnp.asarray(azimuth)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
