@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -26,7 +26,7 @@ from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_window
 from dfsm.model import DFSM
 from dfsm.read.openfast import wind_warning
 from dfsm.samples import FitSettings, Samples, extract, select
-from dfsm.signals import Provenance, Region, SignalTable
+from dfsm.signals import Provenance, Region
 from dfsm.simulate import Status, simulate
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.types import Array
@@ -198,7 +198,7 @@ def _correct(
     else:
         large = []
     decisions = []
-    for i, (name, unit) in enumerate(_target_names(samples.signals, derivatives)):
+    for i, (name, unit) in enumerate(_target_names(samples, derivatives)):
         if i in known:
             text = "kinematic, its rate is a state"
         elif ratio[i] <= choices.gate:
@@ -237,10 +237,10 @@ def _apply(model: Any, inputs: Array) -> jax.Array:
     return jax.vmap(model)(jnp.asarray(inputs))
 
 
-def _target_names(signals: SignalTable, derivatives: bool) -> list[tuple[str, str]]:
-    if not derivatives:
-        return [(c.name, c.unit) for c in signals.outputs]
-    return [(f"d/dt {c.name}", f"{c.unit}/s") for c in signals.states]
+def _target_names(samples: Samples, derivatives: bool) -> Sequence[tuple[str, str]]:
+    if derivatives:
+        return samples.derivative_names
+    return [(c.name, c.unit) for c in samples.signals.outputs]
 
 
 def _fit_nonlinear(samples: Samples, region: Region, choices: FitSettings) -> DFSM:
@@ -338,6 +338,7 @@ def _record(
 ) -> dict[str, Any]:
     return {
         "settings": asdict(choices),
+        "channels": list(data[0].names),
         "data": [
             {"name": r.name, "samples": len(r), "sha256": r.digest, "seconds": r.duration}
             for r in data

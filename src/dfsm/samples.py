@@ -97,6 +97,8 @@ class Samples:
         Run index of each sample, shape ``(sample,)``.
     signals
         What the columns mean.
+    derivative_names
+        Name and unit of each state derivative.
     """
 
     inputs: Array
@@ -105,6 +107,7 @@ class Samples:
     harmonics: Array
     runs: IntArray
     signals: SignalTable
+    derivative_names: tuple[tuple[str, str], ...]
 
     def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
         """Samples run by run."""
@@ -141,11 +144,13 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
 def extract(data: Dataset, choices: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
     parts: list[list[Array]] = []
+    labels: tuple[tuple[str, str], ...] = ()
     for run in track(data, "derivatives"):
         found = differentiate(run, choices.states, choices.derivatives)
+        labels = tuple(zip(found.derivative_names, found.derivative_units, strict=True))
         whole = found.trajectory
         inside = whole.window(choices.start, choices.stop)
-        rows = (whole.time >= inside.time[0]) & (whole.time <= inside.time[-1])
+        rows = np.isin(whole.time, inside.time)
         names = (*choices.controls, *choices.disturbances, *found.names, *choices.parameters)
         parts.append(
             [
@@ -164,6 +169,7 @@ def extract(data: Dataset, choices: FitSettings) -> Samples:
         harmonics=harmonics,
         runs=np.repeat(np.arange(len(data)), lengths),
         signals=_signals(data, choices),
+        derivative_names=labels,
     )
 
 
