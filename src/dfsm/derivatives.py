@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dfsm.errors import DfsmError, near_matches
 from dfsm.filters import Filter, filtered
 from dfsm.settings import settings
 from dfsm.smoothing import SmoothResult, cubic_spline, interpolate, smoothing_spline
 from dfsm.trajectory import Trajectory
+from dfsm.types import Array
 
 __all__ = [
     "DerivativeSettings",
@@ -35,8 +35,6 @@ __all__ = [
     "state_names",
     "state_units",
 ]
-
-Array = NDArray[np.float64]
 
 
 @settings
@@ -249,17 +247,18 @@ def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeS
     state = _estimate(run, spec.name, chosen, settings)
     if spec.rate is not None:
         _check_unit(run, spec, spec.rate, 1)
-        recorded = filtered(run.time, run[spec.rate], chosen)
         if spec.order == 2 and spec.acceleration is None:
             rate = _estimate(run, spec.rate, chosen, settings)
             state = replace(state, rate=rate.q, acceleration=rate.rate)
         else:
-            state = replace(state, rate=recorded)
+            state = replace(state, rate=filtered(run.time, run[spec.rate], chosen))
     if spec.acceleration is not None:
         _check_unit(run, spec, spec.acceleration, 2)
         recorded = filtered(run.time, run[spec.acceleration], chosen)
         state = replace(state, acceleration=recorded)
-    for values, what in ((state.q, "state"), (state.rate, "rate of state")):
+    # The rate of a state of order 1 is only a derivative, and that may be constant.
+    checks = [(state.q, "state"), (state.rate, "rate of state")][: spec.order]
+    for values, what in checks:
         if np.ptp(values) <= 1e-12 * np.abs(values).max():
             raise DfsmError(
                 f"{run.where}: {what} '{spec.name}' is constant, so nothing can be learnt about "
@@ -272,15 +271,14 @@ def _estimate(
     run: Trajectory, name: str, chosen: Filter | None, settings: DerivativeSettings
 ) -> _State:
     time, values = run.time, run[name]
-    noise = None
     try:
         if settings.method == "cubic_spline":
-            return _State(*cubic_spline(time, filtered(time, values, chosen)), noise)
+            return _State(*cubic_spline(time, filtered(time, values, chosen)), None)
         smooth = smoothing_spline(time, values, run.channel(name).step)
-        noise = smooth.noise_std
         if chosen is None:
-            return _State(smooth.values, smooth.first, smooth.second, noise)
-        return _State(*interpolate(time, filtered(time, smooth.values, chosen)), noise)
+            return _State(smooth.values, smooth.first, smooth.second, smooth.noise_std)
+        filtered_values = filtered(time, smooth.values, chosen)
+        return _State(*interpolate(time, filtered_values), smooth.noise_std)
     except DfsmError as error:
         raise DfsmError(f"{run.where}: channel '{name}': {error}") from None
 
@@ -318,8 +316,8 @@ def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None
     if unit and given and _time_power(given) != _time_power(wanted):
         raise DfsmError(
             f"{run.where}: channel '{name}' in '{given}' is not the "
-            f"{('first', 'second')[times - 1]} derivative of '{spec.name}' in '{unit}': a channel in '{wanted}' is expected, name another or "
-            "leave it out"
+            f"{('first', 'second')[times - 1]} derivative of '{spec.name}' in '{unit}': a channel "
+            f"in '{wanted}' is expected, name another or leave it out"
         )
 
 

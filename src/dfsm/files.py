@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -52,29 +54,54 @@ def write_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> Iterat
         `path` exists and is not ours, or cannot be written.
     """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and (not any(path.iterdir()) or is_ours(path))):
-        raise DfsmError(
-            f"{path} exists and is not a folder that dfsm wrote: choose another name or remove it"
-        )
+    check_folder(path, is_ours=is_ours)
     with _sentences(path):
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         try:
             yield temporary
             temporary.chmod(0o777 & ~_umask())
-            if path.exists():
-                old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-                path.rename(old / "replaced")
-                try:
-                    temporary.rename(path)
-                except BaseException:
-                    (old / "replaced").rename(path)
-                    raise
-                finally:
-                    shutil.rmtree(old, ignore_errors=True)
-            else:
-                temporary.rename(path)
+            for file in temporary.iterdir():
+                file.chmod(0o666 & ~_umask())
+            _exchange(temporary, path)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> None:
+    """Fail where `write_folder` would refuse: call it before long work, not after.
+
+    Raises
+    ------
+    DfsmError
+        `path` exists and is not ours, or its parent is no folder.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and (not any(path.iterdir()) or is_ours(path))):
+        raise DfsmError(
+            f"{path} exists and is not a folder that dfsm wrote: choose another name or remove it"
+        )
+    if not path.parent.is_dir():
+        raise DfsmError(
+            f"{path} cannot be written: there is no folder {path.parent}, make it first"
+        )
+
+
+def _exchange(new: Path, path: Path) -> None:
+    """Put `new` in the place of `path`; what stood there comes back if that fails."""
+    if not path.exists():
+        new.rename(path)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+    old = aside / path.name
+    try:
+        path.rename(old)
+        new.rename(path)
+    except BaseException:
+        if old.exists() and not path.exists():
+            old.rename(path)
+        raise
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextmanager
@@ -92,3 +119,21 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def write_json(path: str | Path, value: object) -> None:
+    """Write JSON atomically; numbers that are not finite become null, which JSON can hold."""
+    with write_file(path) as temporary:
+        text = json.dumps(json_value(value), indent=2, allow_nan=False, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def json_value(value: object) -> object:
+    """Turn nested mappings, sequences and numbers into what strict JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(k): json_value(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

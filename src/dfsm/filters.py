@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.signal import butter, sosfiltfilt
 
 from dfsm.errors import DfsmError, near_matches
 from dfsm.settings import settings
 from dfsm.smoothing import checked
 from dfsm.trajectory import Channel, Trajectory
-
-Array = NDArray[np.float64]
+from dfsm.types import Array
 
 
 @settings

@@ -18,13 +18,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from dfsm.corrective import Corrective, NoCorrection, fit_corrective
 from dfsm.derivatives import kinematic_rows
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
 from dfsm.model import DFSM
-from dfsm.read.openfast import wind_warning
+from dfsm.read.wind import wind_warning
 from dfsm.samples import FitSettings, Samples, extract, select
 from dfsm.signals import Provenance, Region
 from dfsm.simulate import Status, simulate
@@ -56,6 +57,9 @@ class FitResult:
     seconds: Mapping[str, float]
 
 
+# Threads gain next to nothing on matrices this narrow, and where other programs use the machine
+# they wait for each other: measured five times slower on two loaded cores.
+@threadpool_limits.wrap(limits=1)
 def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
     """Fit a multi-fidelity derivative function surrogate model.
 

@@ -14,7 +14,13 @@ from dfsm.errors import DfsmError
 from dfsm.linear import LPV, LTI
 from dfsm.progress import track
 from dfsm.settings import settings
-from dfsm.signals import Azimuth, SignalTable, blade_harmonics, radians_per_second
+from dfsm.signals import (
+    Azimuth,
+    SignalTable,
+    blade_harmonics,
+    radians_per_second,
+    with_corrected_wind,
+)
 from dfsm.trajectory import Channel, Dataset, Role, Trajectory
 from dfsm.types import Array, IntArray
 
@@ -43,6 +49,9 @@ class FitSettings:
         standard deviation.
     azimuth
         Blade-passing harmonics for the outputs.
+    hub_height
+        In m; adds the channel ``RtVAvgxhCorr``, the rotor wind without the platform's motion, to
+        runs that only have ``RtVAvgxh``.
     nonlinear_only
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
@@ -61,6 +70,7 @@ class FitSettings:
     corrective: CorrectiveChoice = field(default_factory=RBF)
     gate: float = 0.02
     azimuth: Azimuth | None = None
+    hub_height: float | None = None
     nonlinear_only: bool = True
     seed: int = 0
 
@@ -123,6 +133,7 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
     names = dict.fromkeys(roles)
     if choices.azimuth is not None and choices.azimuth.angle is not None:
         names[choices.azimuth.angle] = None
+    runs = [with_corrected_wind(r, choices.hub_height) for r in runs]
     picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
     for run in picked:
         run.window(choices.start, choices.stop)
@@ -189,6 +200,7 @@ def _signals(data: Dataset, choices: FitSettings) -> SignalTable:
         specs=tuple(choices.states),
         derivatives=choices.derivatives,
         azimuth=choices.azimuth,
+        hub_height=choices.hub_height,
     )
     _ = table.azimuth_rate  # fails here, not in the middle of a simulation
     return table

@@ -6,6 +6,7 @@ that each stands for, and so allow both the paper's cluster-mean targets and pla
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -112,6 +113,7 @@ def nearest(inputs: Array, points: Array) -> IntArray:
 
 def _kmeans(inputs: Array, size: int, rng: np.random.Generator) -> Array:
     from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
 
     limit = _SAMPLES_PER_CENTRE * size
     if len(inputs) > limit:
@@ -120,7 +122,10 @@ def _kmeans(inputs: Array, size: int, rng: np.random.Generator) -> Array:
     # The stub of scikit-learn knows only the string form of n_init.
     one: Any = 1
     model: Any = KMeans(size, init="k-means++", n_init=one, random_state=state, max_iter=50)
-    return model.fit(inputs).cluster_centers_
+    with warnings.catch_warnings():
+        # Fewer distinct samples than centres: `subsample` drops those that stand for none.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return model.fit(inputs).cluster_centers_
 
 
 def _maxmin(inputs: Array, size: int, rng: np.random.Generator) -> IntArray:

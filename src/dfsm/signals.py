@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 import dfsm.precision  # noqa: F401
 from dfsm.derivatives import DerivativeSettings, StateSpec
 from dfsm.errors import DfsmError, near_matches
+from dfsm.read.wind import CORRECTED_WIND, undisturbed_rotor_wind
 from dfsm.settings import settings
-from dfsm.trajectory import Channel
+from dfsm.trajectory import Channel, Trajectory
 
 # Radians per second in one unit of a rotor or generator speed.
 _SPEED_UNITS = {"rpm": np.pi / 30, "rad/s": 1.0, "deg/s": np.pi / 180}
@@ -60,6 +61,9 @@ class SignalTable:
         How derivatives were extracted; initial rates of a rollout are found the same way.
     azimuth
         Blade-passing harmonics of the output function, if any.
+    hub_height
+        In m; where set, runs get the rotor wind corrected for the platform's motion as channel
+        ``RtVAvgxhCorr``, see `undisturbed_rotor_wind`.
     """
 
     states: tuple[Channel, ...]
@@ -70,6 +74,7 @@ class SignalTable:
     specs: tuple[StateSpec, ...]
     derivatives: DerivativeSettings = field(hash=False)
     azimuth: Azimuth | None = None
+    hub_height: float | None = None
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
@@ -98,6 +103,13 @@ class SignalTable:
             )
         column = names.index(self.azimuth.speed)
         return column, radians_per_second(self.states[column])
+
+
+def with_corrected_wind(run: Trajectory, hub_height: float | None) -> Trajectory:
+    """Add the corrected rotor wind to a run that lacks it, where a hub height is set."""
+    if hub_height is None or CORRECTED_WIND in run:
+        return run
+    return undisturbed_rotor_wind(run, hub_height)
 
 
 def radians_per_second(speed: Channel) -> float:

@@ -10,7 +10,7 @@ import time as clock
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,7 @@ from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.integrate import Rollout, adapt, march, mesh_of
 from dfsm.model import DFSM
 from dfsm.settings import settings
+from dfsm.signals import with_corrected_wind
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 
@@ -29,6 +30,10 @@ _ESCAPE = 10.0
 # record starts there, just after it): long enough for a derivative, too short to leak a response.
 _HISTORY = 20.0
 _HEAD = 1.0
+
+
+Method = Literal["rk4", "tsit5", "kvaerno5"]
+METHODS: tuple[str, ...] = get_args(Method)
 
 
 @settings
@@ -48,7 +53,7 @@ class SimulationSettings:
         Inputs between samples: ``"linear"`` or ``"cubic"`` spline.
     """
 
-    method: Literal["rk4", "tsit5", "kvaerno5"] = "rk4"
+    method: Method = "rk4"
     step: float | None = None
     rtol: float = 1e-6
     atol: float = 1e-8
@@ -172,6 +177,7 @@ def simulate(
     options = options or SimulationSettings()
     single = isinstance(runs, Trajectory)
     batch = [runs] if isinstance(runs, Trajectory) else list(runs)
+    batch = [with_corrected_wind(r, model.signals.hub_height) for r in batch]
     if not batch:
         raise DfsmError("no runs were given to simulate")
     names = model.signals.exogenous

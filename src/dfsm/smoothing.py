@@ -1,7 +1,7 @@
 """Splines that differentiate: a quintic that finds its own amount of smoothing, and the paper's.
 
-The smoothing fit minimises ``sum (y_i - f(t_i))**2 + λ ∫ f'''(t)**2 dt`` over quintic splines. λ comes from
-the noise level where the file states its quantisation step, else from generalised
+The smoothing fit minimises ``sum (y_i - f(t_i))**2 + λ ∫ f'''(t)**2 dt`` over quintic splines.
+λ comes from the noise level where the file states its quantisation step, else from generalised
 cross-validation. Penalising the third derivative is what makes the *second* derivative good: a
 cubic smoothing spline penalises the very quantity that is wanted.
 
@@ -17,15 +17,15 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from dfsm.errors import DfsmError
-
-Array = NDArray[np.float64]
+from dfsm.types import Array, IntArray
 
 MIN_SAMPLES = 8
+_CROSS_VALIDATED = 20  # with fewer samples, noise cannot be told from curvature
 _DEGREE = 5
 _WIDTH = _DEGREE + 1  # B-splines that are not zero at a point
 # Smoothing length λ^(1/6) over knot spacing: each set of knots serves the range _KEEP to _HEAVY.
@@ -73,7 +73,11 @@ def smoothing_spline(time: ArrayLike, values: ArrayLike, step: float | None = No
     the discrepancy principle with the fit's own degrees of freedom). That also holds for coarse
     steps, whose rounding errors are not white, where cross-validation follows the staircase.
     Without a step, or where the signal holds more noise than the step explains, λ minimises
-    the generalised cross-validation score ``RSS / (N - tr H)**2`` (Craven and Wahba, 1979).
+    the generalised cross-validation score ``RSS / (N - tr H)**2`` (Craven and Wahba, 1979);
+    data without visible noise, and fewer than 20 samples, are interpolated.
+
+    Near the ends, over a few ``(λ h)**(1/6)`` for samples h apart, the second derivative levels
+    off: there is data on one side only.
 
     Parameters
     ----------
@@ -98,14 +102,15 @@ def smoothing_spline(time: ArrayLike, values: ArrayLike, step: float | None = No
     t, y = checked(time, values)
     if step is not None and not (np.isfinite(step) and step > 0):
         raise DfsmError(f"a quantisation step of {step} was given: give a positive one or None")
-    known = None if step is None else step / np.sqrt(12)
-    if np.ptp(y) == 0:
+    known = None if step is None else float(step) / 12**0.5
+    centre, scale = float(y.mean()), float(np.ptp(y))
+    if scale < np.finfo(np.float64).tiny:
         zero = np.zeros_like(y)
         return SmoothResult(y, zero, zero, known or 0.0, np.inf, 1.0, "interpolation")
     mesh = _mesh(t.tobytes())
-    centre, scale = y.mean(), y.std()
     z = (y - centre) / scale
-    found = _choose(mesh, z, None if known is None else (known / scale) ** 2)
+    # Noise beyond a thousand times the signal's range leaves a parabola, as a thousand does.
+    found = _choose(mesh, z, None if known is None else min(known / scale, 1e3) ** 2)
     if found is None:
         return SmoothResult(*interpolate(t, y), 0.0, 0.0, float(len(t)), "interpolation")
     level, lam, noise, chosen_by = found
@@ -115,8 +120,8 @@ def smoothing_spline(time: ArrayLike, values: ArrayLike, step: float | None = No
         values=y - scale * residual,
         first=spline(mesh.x, 1) * (scale / mesh.h),
         second=spline(mesh.x, 2) * (scale / mesh.h**2),
-        noise_std=float(noise * scale),
-        smoothing=lam * mesh.h**5,
+        noise_std=known if known and chosen_by == "noise level" else noise * scale,
+        smoothing=float(lam * mesh.h**5),
         degrees_of_freedom=level.degrees_of_freedom(lam),
         chosen_by=chosen_by,
     )
@@ -231,6 +236,8 @@ def _choose(mesh: _Mesh, z: Array, variance: float | None) -> _Chosen | None:
                 part = (misfit[-1] - np.log(variance * allowance)) / (misfit[-1] - misfit[-2])
                 lam *= (path[-2][1] / lam) ** part
             return level, lam, float(np.sqrt(variance)), "noise level"
+    if n < _CROSS_VALIDATED:
+        return None
     return _cross_validate(path, np.array(misfit), np.array(free), np.array(ends))
 
 
@@ -266,7 +273,7 @@ class _Level:
         self.size = len(sites)
         self.basis = BSpline.design_matrix(x, self.knots, _DEGREE)
         rows = np.asarray(self.basis.data, dtype=np.float64).reshape(-1, _WIDTH)
-        start = self.basis.indices.reshape(-1, _WIDTH)[:, 0]
+        start = np.asarray(self.basis.indices, dtype=np.int64).reshape(-1, _WIDTH)[:, 0]
         self.gram = _banded_gram(rows, start, self.size)
         self.penalty = _banded_gram(*_third_derivatives(self.knots), self.size)
         self._degrees_of_freedom: dict[float, float] = {}
@@ -311,7 +318,7 @@ class _Mesh:
         for k in reversed(range(len(self.levels))):
             spacing = self.finest * _THINNING**k
             # The coarsest level has nothing above it and goes on to where a parabola is left.
-            heavy = _HEAVY * (_THINNING if k == len(self.levels) - 1 else 1.0)
+            heavy = _HEAVY * (2.0 if k == len(self.levels) - 1 else 1.0)
             light = _KEEP if k > 0 else _LIGHT
             count = round(_STEPS * np.log(heavy / light) / np.log(_THINNING))
             for j in range(count):
@@ -337,7 +344,7 @@ def _spaced(x: Array, spacing: float) -> Array:
     return x[keep]
 
 
-def _banded_gram(rows: Array, start: NDArray[np.integer], size: int) -> Array:
+def _banded_gram(rows: Array, start: IntArray, size: int) -> Array:
     """Upper banded ``RᵀR`` of a matrix whose row i holds ``rows[i]`` from column ``start[i]``."""
     gram = np.zeros((_WIDTH, size))
     for a in range(_WIDTH):
@@ -347,7 +354,7 @@ def _banded_gram(rows: Array, start: NDArray[np.integer], size: int) -> Array:
     return gram
 
 
-def _third_derivatives(knots: Array) -> tuple[Array, NDArray[np.integer]]:
+def _third_derivatives(knots: Array) -> tuple[Array, IntArray]:
     """Rows R with ``∫ f'''**2 = |R c|²``: Gauss points, exact for the squared parabolas."""
     d = np.ones((len(knots) - _WIDTH, 1))  # coefficients of the derivative from those of f
     inner, degree = knots, _DEGREE

@@ -18,7 +18,7 @@ from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.model import DFSM
 from dfsm.progress import track
-from dfsm.signals import Azimuth, radians_per_second
+from dfsm.signals import Azimuth, radians_per_second, with_corrected_wind
 from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
 from dfsm.spectra import Band, Spectrum, spectrum
 from dfsm.trajectory import Channel, Trajectory
@@ -156,9 +156,22 @@ class Validation:
 
     def mean_nrmse(self, model: str, channel: str) -> float | None:
         """Mean NRMSE over the test runs; None if the model did not complete all of them."""
+        return self.mean_error(model, channel, "nrmse")
+
+    def mean_error(self, model: str, channel: str, what: str) -> float | None:
+        """Mean of one figure of `ChannelError` over the test runs, as `mean_nrmse`."""
         found = [r.models[model].errors.get(channel) for r in self.runs]
-        values = [e.nrmse for e in found if e is not None]
+        values = [getattr(e, what) for e in found if e is not None]
         return float(np.mean(values)) if len(values) == len(self.runs) else None
+
+    def endings(self) -> list[str]:
+        """One sentence per rollout that ended early."""
+        return [
+            f"{name} on {r.recorded.name}: {m.simulation.reason}"
+            for r in self.runs
+            for name, m in r.models.items()
+            if m.simulation.status is not Status.COMPLETED
+        ]
 
     def completed(self, model: str) -> int:
         """Number of test runs that a model simulated to the end."""
@@ -243,7 +256,7 @@ def validate(
     if isinstance(models, DFSM):
         models = compared(models)
     first = next(iter(models.values()))
-    runs = list(runs)
+    runs = [with_corrected_wind(r, first.signals.hub_height) for r in runs]
     if not runs:
         raise DfsmError("no test runs were given, at least one is needed")
     notes = _leaks(first, runs)

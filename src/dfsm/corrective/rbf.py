@@ -82,6 +82,8 @@ def fit_rbf(data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF) 
     Q, right = products[:n, :n], products[:n, n:]
     if isinstance(choice, IncrementalRBF):
         used = _forward_selection(Q, right, np.diag(products)[n:], choice.goal, choice.neurons)
+        # Few units explain less than all candidates do, and want another ridge.
+        error, ridge = _cross_validate(search, points.points[used], base * width)
     else:
         used = np.arange(n)
     eigenvalues, V = np.linalg.eigh(Q[np.ix_(used, used)])

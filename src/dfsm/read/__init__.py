@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import glob
+import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from dfsm.errors import DfsmError
 from dfsm.progress import track
 from dfsm.read.assemble import existing_file
 from dfsm.read.info import ChannelInfo, RunInfo, describe
-from dfsm.read.openfast import read_openfast, undisturbed_rotor_wind, wind_warning
+from dfsm.read.openfast import read_openfast
 from dfsm.read.tables import read_table, write_table
+from dfsm.read.wind import undisturbed_rotor_wind, wind_warning
 from dfsm.trajectory import Trajectory
 
 __all__ = [
@@ -24,6 +27,7 @@ __all__ = [
     "read_table",
     "undisturbed_rotor_wind",
     "wind_warning",
+    "with_wall_times",
     "write_table",
 ]
 
@@ -98,6 +102,31 @@ def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[T
         for path in _expand(pattern, base):
             paths.setdefault(path.resolve(), path)
     return [read(path) for path in track(list(paths.values()), "Reading runs")]
+
+
+def with_wall_times(runs: Iterable[Trajectory], path: str | Path) -> list[Trajectory]:
+    """Add the simulator's recorded wall times, for speed-ups.
+
+    Parameters
+    ----------
+    runs
+        Whole runs, as read.
+    path
+        JSON file that maps run names to seconds for the whole run; names it lacks stay as they
+        are.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing or holds something else.
+    """
+    path = existing_file(path)
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        seconds = {str(name): float(value) for name, value in table.items()}
+    except (ValueError, TypeError, AttributeError):
+        raise DfsmError(f"{path} is not a JSON table of run names and seconds") from None
+    return [replace(r, wall_time=seconds.get(r.name, r.wall_time)) for r in runs]
 
 
 def _expand(pattern: str | Path, base: Path | None) -> list[Path]:

@@ -1,0 +1,276 @@
+"""The command line: one verb per thing a user wants; every mistake is one sentence.
+
+Exit codes: 0 done · 1 done, but a simulation ended early · 2 bad input · 3 a bug in dfsm ·
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.progress import show_progress
+
+if TYPE_CHECKING:
+    from dfsm.simulate import Simulation
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Derivative function surrogate models from time-domain simulations.",
+)
+
+Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+
+
+@app.command()
+def info(files: Files, as_json: AsJson = False) -> None:
+    """List channels, units, ranges, sampling and quantisation, and what looks wrong."""
+    from dfsm.console import print_info
+    from dfsm.read import describe, read_all
+
+    with show_progress():
+        found = [describe(run) for run in read_all(files)]
+    if as_json:
+        _print_json([f.to_dict() for f in found])
+    else:
+        print_info(found)
+
+
+@app.command()
+def init(
+    files: Files,
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")] = Path(
+        "config.yaml"
+    ),
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a commented configuration with the channels found in the files."""
+    from dfsm.template import write_config
+
+    if output.exists() and not force:
+        raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
+    with show_progress(not quiet):
+        write_config(files, output)
+    _say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
+
+
+@app.command()
+def fit(
+    config: Annotated[Path, typer.Argument(help="Configuration made by dfsm init.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Model folder to write.")],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit a multi-fidelity model and save it as a folder."""
+    from dfsm.config import load_config
+    from dfsm.fit import fit as run_fit
+    from dfsm.storage import check_target, save
+
+    check_target(output)
+    with show_progress(not quiet):
+        settings, runs = load_config(config)
+        result = run_fit(runs, settings.fit_settings())
+    save(result.model, output, result.nonlinear)
+    if as_json:
+        from dfsm.files import json_value
+
+        _print_json(json_value(dict(result.model.provenance.record)))
+        return
+    _say(result.model.summary(), quiet)
+    seconds = sum(result.seconds.values())
+    _say(f"fitted {len(runs)} runs in {seconds:.1f} s, saved in {output}", quiet)
+
+
+@app.command()
+def summary(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+) -> None:
+    """Describe a saved model: signals, decisions, eigenvalues, warnings."""
+    from dfsm.storage import load
+
+    typer.echo(load(model).summary())
+
+
+@app.command()
+def validate(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    files: Files,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="HTML report to write.")
+    ] = None,
+    metrics: Annotated[
+        Path | None, typer.Option("--json", help="JSON file with all figures to write.")
+    ] = None,
+    wall_times: Annotated[
+        Path | None,
+        typer.Option(help="JSON file: run name to seconds the simulator took, for speed-ups."),
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option(help="Start of the test window in s; default as in the fit.")
+    ] = None,
+    stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate test runs, compare with what was recorded, write a report."""
+    from dfsm.console import print_validation
+    from dfsm.files import write_json
+    from dfsm.read import read_all, with_wall_times
+    from dfsm.report import write_report
+    from dfsm.storage import NONLINEAR, load_all
+    from dfsm.validate import compared
+    from dfsm.validate import validate as run_validate
+
+    models = load_all(model)
+    main = next(iter(models.values()))
+    settings = main.provenance.record.get("settings", {})
+    start = settings.get("start") if start is None else start
+    with show_progress(not quiet):
+        runs = read_all(files)
+        if wall_times is not None:
+            runs = with_wall_times(runs, wall_times)
+        candidates = compared(main, models.get(NONLINEAR))
+        found = run_validate(candidates, runs, start=start, stop=stop)
+        if output is not None:
+            write_report({model.name or str(model): found}, output)
+    if metrics is not None:
+        write_json(metrics, found.to_dict())
+    if not quiet:
+        print_validation(found)
+    for path in (output, metrics):
+        if path is not None:
+            _say(f"wrote {path}", quiet)
+    _exit_if_ended([r.models[m].simulation for r in found.runs for m in ("multi-fidelity",)], quiet)
+
+
+@app.command()
+def simulate(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    run: Annotated[str, typer.Argument(help="File with the inputs and the initial state.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
+    start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
+    stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
+    method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
+    step: Annotated[
+        float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate the model with the inputs of one run and write states and outputs."""
+    from dfsm.read import read, write_table
+    from dfsm.simulate import METHODS, SimulationSettings
+    from dfsm.simulate import simulate as run_simulate
+    from dfsm.storage import load
+
+    if method not in METHODS:
+        raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    surrogate = load(model)
+    settings = surrogate.provenance.record.get("settings", {})
+    start = settings.get("start") if start is None else start
+    with show_progress(not quiet), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)  # the outcome is printed below
+        result = run_simulate(
+            surrogate,
+            read(run),
+            start=start,
+            stop=stop,
+            options=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
+        )
+    write_table(result.trajectory, output)
+    if as_json:
+        _print_json(
+            {
+                "status": result.status.name.lower(),
+                "message": result.message,
+                "ended_s": result.ended,
+                "outside": result.outside,
+                "wall_time_s": result.wall_time,
+                "output": str(output),
+            }
+        )
+    else:
+        _say(f"wrote {output} ({len(result.trajectory)} samples): {result.message}", quiet)
+    _exit_if_ended([result], quiet or as_json)
+
+
+def main() -> None:
+    """Run the command line; the only place that turns errors into exit codes."""
+    warnings.showwarning = _show_warning
+    try:
+        code = app(standalone_mode=False)
+    except DfsmError as error:
+        code = _fail(f"error: {error}", 2)
+    except KeyboardInterrupt:
+        code = _fail("interrupted: nothing was left half-written", 130)
+    except BrokenPipeError:
+        # The reader of our output has gone (… | head); there is nobody left to tell.
+        sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
+        code = 0
+    except Exception as error:
+        code = _unexpected(error)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _unexpected(error: Exception) -> int:
+    """Usage errors of the command-line library, and bugs."""
+    if hasattr(error, "format_message"):
+        context = getattr(error, "ctx", None)
+        usage = f"{context.get_usage()}\n" if context is not None else ""
+        return _fail(f"{usage}error: {error.format_message()}", 2)  # pyright: ignore[reportAttributeAccessIssue]
+    if type(error).__name__ == "Abort":
+        return _fail("interrupted: nothing was left half-written", 130)
+    if type(error).__name__ == "Exit":
+        return int(getattr(error, "exit_code", 0))
+    if os.environ.get("DFSM_DEBUG"):
+        raise error
+    return _fail(
+        f"bug in dfsm: {type(error).__name__}: {error}\n"
+        "please report it with the traceback that DFSM_DEBUG=1 shows",
+        3,
+    )
+
+
+def _fail(message: str, code: int) -> int:
+    print(message, file=sys.stderr)
+    return code
+
+
+def _say(message: str, quiet: bool) -> None:
+    if not quiet:
+        typer.echo(message)
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def _exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:
+    from dfsm.simulate import Status
+
+    ended = [s for s in simulations if s.status is not Status.COMPLETED]
+    if ended:
+        if not quiet:
+            print(f"{len(ended)} of {len(simulations)} simulations ended early", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
+    if issubclass(category, DfsmWarning):
+        print(f"warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

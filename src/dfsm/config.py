@@ -1,0 +1,187 @@
+"""`config.yaml`: which files, which signals, which settings; checked before any work starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
+from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.errors import DfsmError, near_matches
+from dfsm.linear import LPV, LTI
+from dfsm.read import read_all
+from dfsm.samples import FitSettings
+from dfsm.signals import Azimuth
+from dfsm.trajectory import Trajectory
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DataConfig(_Strict):
+    """Training files and the part of them that is used.
+
+    Attributes
+    ----------
+    train
+        File names or patterns, relative to the configuration file.
+    start, stop
+        Time window in s; null leaves that end open.
+    hub_height
+        In m; adds the corrected rotor wind ``RtVAvgxhCorr`` to every run.
+    """
+
+    train: list[str]
+    start: float | None = None
+    stop: float | None = None
+    hub_height: float | None = None
+
+
+class SignalConfig(_Strict):
+    """Channel names by role, see `FitSettings`."""
+
+    states: list[StateSpec]
+    controls: list[str] = []
+    disturbances: list[str] = []
+    parameters: list[str] = []
+    outputs: list[str] = []
+
+
+class Config(_Strict):
+    """A whole `config.yaml`."""
+
+    data: DataConfig
+    signals: SignalConfig
+    derivatives: DerivativeSettings = DerivativeSettings()
+    linear: Annotated[LTI | LPV, Field(discriminator="kind")] = LTI()
+    corrective: Annotated[
+        RBF | IncrementalRBF | GP | MLP | NoCorrection, Field(discriminator="kind")
+    ] = RBF()
+    gate: float = FitSettings.gate
+    azimuth: Azimuth | None = None
+    nonlinear_only: bool = FitSettings.nonlinear_only
+    seed: int = FitSettings.seed
+
+    def fit_settings(self) -> FitSettings:
+        """The settings of `fit`."""
+        s = self.signals
+        return FitSettings(
+            states=tuple(s.states),
+            controls=tuple(s.controls),
+            disturbances=tuple(s.disturbances),
+            parameters=tuple(s.parameters),
+            outputs=tuple(s.outputs),
+            start=self.data.start,
+            stop=self.data.stop,
+            hub_height=self.data.hub_height,
+            derivatives=self.derivatives,
+            linear=self.linear,
+            corrective=self.corrective,
+            gate=self.gate,
+            azimuth=self.azimuth,
+            nonlinear_only=self.nonlinear_only,
+            seed=self.seed,
+        )
+
+
+def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
+    """Read a configuration and the training runs that it names.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing or not YAML, a key is unknown or has a wrong type (its path is
+        given), or a pattern matches no file.
+    """
+    path = Path(path)
+    config = parse_config(path)
+    return config, read_all(config.data.train, path.parent)
+
+
+def parse_config(path: Path) -> Config:
+    """Read and check a configuration without touching the data."""
+    try:
+        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DfsmError(
+            f"{path} cannot be read ({error.strerror}): make one with dfsm init"
+        ) from None
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else "?"
+        raise DfsmError(f"{path}, line {line}: not valid YAML ({error.problem})") from None
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise DfsmError(f"{path} is not valid YAML ({str(error).splitlines()[0]})") from None
+    if not isinstance(raw, dict):
+        raise DfsmError(f"{path} holds no keys; make a configuration with dfsm init")
+    try:
+        return Config.model_validate(raw)
+    except ValidationError as error:
+        raise DfsmError(f"{path}: {_explain(error, raw)}") from None
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
+
+
+def _explain(error: ValidationError, raw: dict[str, Any]) -> str:
+    """The first thing wrong, with the path of its key as it stands in the file."""
+    first = error.errors()[0]
+    if first["type"] == "value_error":
+        # Raised by a settings class itself, already one sentence.
+        return str(first.get("ctx", {}).get("error", first["msg"]))
+    keys = _path(first["loc"], raw)
+    where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _known_keys(keys[:-1])
+        return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
+    if first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument"):
+        return f"key '{where}' is missing"
+    if first["type"].startswith("union_tag"):
+        kinds = first.get("ctx", {}).get("expected_tags", "")
+        return f"'{where}' needs a key 'kind', one of {kinds}"
+    found = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
+    return f"'{where}': {first['msg'][0].lower()}{first['msg'][1:]}{found}"
+
+
+def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
+    """Drop the names of union members that pydantic puts between the keys of the file."""
+    keys: list[int | str] = []
+    node: Any = raw
+    for i, key in enumerate(loc):
+        try:
+            node = node[key]
+        except (KeyError, IndexError, TypeError):
+            # The last key may be missing from the file, or be wrong; others are pydantic's own.
+            if i < len(loc) - 1:
+                continue
+        keys.append(key)
+    return keys
+
+
+def _known_keys(keys: list[int | str]) -> list[str]:
+    """Keys that may stand at a path, from the JSON schema of the configuration."""
+    schema = Config.model_json_schema()
+    nodes = [schema]
+    for key in keys:
+        nodes = [child for node in nodes for child in _children(schema, node, key)]
+    found = dict.fromkeys(k for node in nodes for k in node.get("properties", {}))
+    return list(found)
+
+
+def _children(schema: dict[str, Any], node: dict[str, Any], key: int | str) -> list[dict[str, Any]]:
+    child = node.get("items") if isinstance(key, int) else node.get("properties", {}).get(key)
+    if child is None:
+        child = node.get("additionalProperties")
+    if not isinstance(child, dict):
+        return []
+    options = child.get("oneOf") or child.get("anyOf") or [child]
+    resolved = [_resolve(schema, o) for o in options]
+    return [r for r in resolved if isinstance(r, dict)]
+
+
+def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    reference = node.get("$ref")
+    return schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node

@@ -1,0 +1,106 @@
+"""Tables for the terminal. Names come from files: they are printed as text, never as markup."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from dfsm.read.info import RunInfo
+    from dfsm.validate import Validation
+
+
+def print_info(runs: Sequence[RunInfo]) -> None:
+    """Print what `dfsm info` found, one table per run."""
+    console = _console()
+    for run in runs:
+        sampling = (
+            f"every {run.interval:g} s"
+            if run.interval is not None
+            else f"irregular, {run.min_interval:g} to {run.max_interval:g} s"
+        )
+        span = f"{run.samples} samples, {run.start:g} to {run.stop:g} s, {sampling}"
+        console.print(Text(f"{run.source or run.name}: {span}"))
+        table = _table("channel", "unit", "min", "max", "mean", "std", "step")
+        for c in run.channels:
+            step = "–" if c.step is None else f"{c.step:.3g}"
+            figures = [f"{v:.5g}" for v in (c.min, c.max, c.mean, c.std)]
+            table.add_row(Text(c.name), Text(c.unit), *figures, step)
+        console.print(table)
+        for text in run.warnings:
+            console.print(Text(f"warning: {text}"))
+
+
+def print_validation(found: Validation) -> None:
+    """Print the mean NRMSE of every channel and variant, and what each variant cost."""
+    print_validations({"": found})
+
+
+def print_validations(found: Mapping[str, Validation]) -> None:
+    """Print one table over several fitted models: errors, times, speed-ups.
+
+    Parameters
+    ----------
+    found
+        Validation per fitted model.
+    """
+    console = _console()
+    variants = list(dict.fromkeys(v for validation in found.values() for v in validation.models))
+    several = len(found) > 1
+    table = _table(*(["model"] if several else []), "channel", "unit", *variants, "RMSE*", "max*")
+    for label, validation in found.items():
+        for i, c in enumerate(validation.channels):
+            row: list[str | Text] = [Text(label if i == 0 else "")] if several else []
+            row += [Text(c.name), Text(c.unit)]
+            row += [_figure(validation.mean_nrmse(v, c.name), ".3f") for v in variants]
+            row += [
+                _figure(validation.mean_error("multi-fidelity", c.name, what), ".4g")
+                for what in ("rmse", "maximum")
+            ]
+            table.add_row(*row, end_section=i == len(validation.channels) - 1)
+    console.print(
+        "NRMSE: RMS error / standard deviation of the recorded signal, mean over test runs"
+    )
+    console.print(table)
+    console.print("* of the multi-fidelity model, in the channel's unit; – a rollout ended early")
+    times = _table(
+        *(["model"] if several else []), "variant", "rollouts done", "wall time", "speed-up"
+    )
+    for label, validation in found.items():
+        for i, variant in enumerate(validation.models):
+            speed = validation.speed_up(variant)
+            row = [Text(label if i == 0 else "")] if several else []
+            row += [
+                variant,
+                f"{validation.completed(variant)} of {len(validation.runs)}",
+                f"{1000 * validation.wall_time(variant):.0f} ms",
+                "–" if speed is None else f"{speed:,.0f} ×",
+            ]
+            times.add_row(*row)
+    console.print(times)
+    for label, validation in found.items():
+        prefix = f"{label}: " if several else ""
+        for text in (*validation.warnings, *validation.endings()):
+            console.print(Text(f"{prefix}{text}"))
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        text = column in ("model", "channel", "unit", "variant")
+        table.add_column(column, justify="left" if text else "right", no_wrap=True)
+    return table
+
+
+def _console() -> Console:
+    # Piped output keeps full rows: a table must not be cut to a terminal that is not there.
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=160)

@@ -1,0 +1,201 @@
+"""What the page's script draws: thinned series, spectra, histograms, eigenvalues, as JSON values.
+
+Nothing here is a figure of merit: those are computed from all samples and stand in the tables.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.signal import resample_poly
+
+from dfsm.simulate import Simulation, Status
+from dfsm.spectra import Band, Spectrum
+from dfsm.trajectory import Trajectory
+from dfsm.types import Array
+from dfsm.validate import (
+    LOW,
+    ChannelStatistics,
+    RunComparison,
+    Validation,
+    _bands,
+)
+
+# Seconds between the samples drawn: fine enough for blade passing (about 0.5 Hz) and a file of a
+# few megabytes. Longer runs are thinned further.
+_STEP = 0.2
+_MOST_POINTS = 6000
+# What a rollout that ended at once leaves is drawn sample by sample.
+_FEW_POINTS = 200
+_HIGHEST = 1.0
+
+
+class Blobs:
+    """Arrays as base64 of little-endian 32-bit floats, each distinct one stored once."""
+
+    def __init__(self) -> None:
+        self.encoded: list[str] = []
+        self._known: dict[bytes, int] = {}
+
+    def add(self, values: Array) -> int:
+        """Store an array and return its index."""
+        limit = np.finfo(np.float32).max
+        data = np.clip(values, -limit, limit).astype("<f4").tobytes()
+        if data not in self._known:
+            self._known[data] = len(self.encoded)
+            self.encoded.append(base64.b64encode(data).decode("ascii"))
+        return self._known[data]
+
+
+def page_data(validations: Mapping[str, Validation]) -> dict[str, Any]:
+    """Return everything that the page's script draws.
+
+    Parameters
+    ----------
+    validations
+        By name of the fitted model.
+
+    Returns
+    -------
+    dict
+        ``blobs``, arrays that the rest refers to by index, and ``models``.
+    """
+    blobs = Blobs()
+    models = [_model(name, v, blobs) for name, v in validations.items()]
+    return {"models": models, "blobs": blobs.encoded}
+
+
+def bands_of(validation: Validation, run: RunComparison) -> tuple[Band, ...]:
+    """Frequency bands in which peaks of this run were compared."""
+    first = next(iter(validation.models.values()))
+    return tuple(b for b in _bands(first, run.recorded) if b is not LOW)
+
+
+def thin(run: Trajectory) -> tuple[float, float, Array]:
+    """Low-pass and decimate a run for drawing.
+
+    Returns
+    -------
+    tuple[float, float, ndarray]
+        First time and step in s, samples of shape ``(time, channel)``.
+    """
+    time, values = run.time, run.values
+    step = float(np.median(np.diff(time)))
+    if run.time_step is None:
+        mesh = np.arange(time[0], time[-1] + step / 2, step)
+        values = np.stack([np.interp(mesh, time, v) for v in values.T], axis=1)
+    factor = max(round(_STEP / step), -(-len(values) // _MOST_POINTS), 1)
+    if len(values) <= _FEW_POINTS:
+        factor = 1
+    if factor == 1 or not np.isfinite(values).all():
+        return float(time[0]), step * factor, values[::factor]
+    # A zero-phase low-pass before decimation keeps fast content from showing up as a slow wave;
+    # the odd extension keeps the ends where they are.
+    thinned = resample_poly(values, 1, factor, axis=0, padtype="antireflect")
+    return float(time[0]), step * factor, thinned
+
+
+def _model(name: str, validation: Validation, blobs: Blobs) -> dict[str, Any]:
+    first = next(iter(validation.models.values()))
+    return {
+        "name": name,
+        "channels": [{"name": c.name, "unit": c.unit} for c in validation.channels],
+        "variants": list(validation.models),
+        "runs": [_run(validation, r, blobs) for r in validation.runs],
+        "histograms": [_histogram(validation, c.name, blobs) for c in validation.channels],
+        "eigenvalues": [
+            {"schedule": float(s), "real": v.real.tolist(), "imag": v.imag.tolist()}
+            for s, v in validation.eigenvalues
+        ],
+        "schedule": first.schedule,
+    }
+
+
+def _run(validation: Validation, run: RunComparison, blobs: Blobs) -> dict[str, Any]:
+    names = [c.name for c in validation.channels]
+    simulations = [m.simulation for m in run.models.values()]
+    return {
+        "name": run.recorded.name,
+        "start": float(run.recorded.time[0]),
+        "stop": float(run.recorded.time[-1]),
+        "ranges": [_range(name, run, simulations) for name in names],
+        "bands": [
+            {"name": b.name, "low": b.low, "high": b.high} for b in bands_of(validation, run)
+        ],
+        "recorded": _series(run.recorded, names, blobs) | _spectra(run.statistics, names, blobs),
+        "variants": {
+            name: _series(m.simulation.trajectory, names, blobs)
+            | _spectra(m.statistics, names, blobs)
+            | _ending(m.simulation, names)
+            for name, m in run.models.items()
+        },
+    }
+
+
+def _series(run: Trajectory, names: Sequence[str], blobs: Blobs) -> dict[str, Any]:
+    start, step, values = thin(run.select(names))
+    return {"t0": start, "dt": step, "y": [blobs.add(v) for v in values.T]}
+
+
+def _spectra(
+    statistics: Mapping[str, ChannelStatistics], names: Sequence[str], blobs: Blobs
+) -> dict[str, Any]:
+    """Spectra up to 1 Hz; None where the rollout did not complete."""
+    if not statistics:
+        return {"psd": None}
+    found = [_shown(statistics[name].spectrum) for name in names]
+    frequency = found[0].frequency
+    return {
+        "psd": [blobs.add(s.density) for s in found],
+        "df": float(frequency[1] - frequency[0]) if len(frequency) > 1 else 1.0,
+    }
+
+
+def _shown(spectrum: Spectrum) -> Spectrum:
+    inside = spectrum.frequency <= _HIGHEST
+    # The mean was removed, so the first bin holds nothing that a logarithmic axis could show.
+    return Spectrum(
+        spectrum.frequency[inside],
+        np.where(spectrum.frequency[inside] > 0, spectrum.density[inside], np.nan),
+    )
+
+
+def _ending(simulation: Simulation, names: Sequence[str]) -> dict[str, Any]:
+    if simulation.status is Status.COMPLETED:
+        return {"ended": None}
+    last = simulation.trajectory.select(names).values[-1]
+    return {
+        "ended": simulation.ended,
+        "message": simulation.reason,
+        "last": np.nan_to_num(last).tolist(),
+    }
+
+
+def _range(name: str, run: RunComparison, simulations: Sequence[Simulation]) -> list[float]:
+    """Y-range of a panel: the recorded signal and what completed rollouts add within reason."""
+    recorded = run.recorded[name]
+    low, high = float(recorded.min()), float(recorded.max())
+    span = (high - low) or max(abs(high), 1.0)
+    reach = 0.6 * span
+    least, most = low, high
+    for s in simulations:
+        values = s.trajectory[name]
+        if s.status is Status.COMPLETED and np.isfinite(values).all():
+            least = min(least, max(float(values.min()), low - reach))
+            most = max(most, min(float(values.max()), high + reach))
+    return [least - 0.12 * span, most + 0.12 * span]
+
+
+def _histogram(validation: Validation, name: str, blobs: Blobs) -> dict[str, Any] | None:
+    """Share of the samples per bin in %; None where no run was completed by all variants."""
+    found = validation.histograms[name]
+    if not all(counts.sum() for counts in found.counts.values()):
+        return None
+    centres = (found.edges[1:] + found.edges[:-1]) / 2
+    return {
+        "x": blobs.add(centres),
+        "share": {m: blobs.add(100 * c / c.sum()) for m, c in found.counts.items()},
+    }

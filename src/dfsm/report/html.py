@@ -1,0 +1,219 @@
+"""Write the report: one HTML file that needs no network, for the browser and for print."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from dfsm.errors import DfsmError
+from dfsm.files import write_file
+from dfsm.report import runs as by_run
+from dfsm.report import sections
+from dfsm.report.elements import Markup, element, join, plural
+from dfsm.report.figures import page_data
+from dfsm.validate import RunComparison, Validation
+
+_PSD_NOTE = "Welch's estimate, Hann windows of 200 s, unfiltered signals. "
+_ERRORS_NOTE = (
+    "Simulated minus recorded, all samples of the test runs that every variant completed; the "
+    "outermost bins hold what lies beyond."
+)
+_ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
+
+
+def write_report(
+    validations: Mapping[str, Validation],
+    path: str | Path,
+    *,
+    title: str = "Derivative function surrogate models: validation",
+) -> None:
+    """Write one self-contained HTML page about one or several validated models.
+
+    Parameters
+    ----------
+    validations
+        By the name under which the fitted model is shown, e.g. ``{"6 m/s": …, "12 m/s": …}``.
+    path
+        File to write; an existing one is replaced when the new one is complete.
+    title
+        Heading of the page.
+
+    Raises
+    ------
+    DfsmError
+        No validations, or the file cannot be written.
+    """
+    if not validations:
+        raise DfsmError("no validations were given, a report needs at least one")
+    text = _page(validations, title)
+    with write_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _page(validations: Mapping[str, Validation], title: str) -> str:
+    from plotly.offline import get_plotlyjs
+
+    own = files("dfsm.report")
+    scripts = [get_plotlyjs(), (own / "page.js").read_text(encoding="utf-8")]
+    css = (own / "page.css").read_text(encoding="utf-8")
+    data = embed(page_data(validations))
+    body = join(_header(validations, title), _main(validations))
+    return "\n".join(
+        [
+            "<!DOCTYPE html>",
+            '<html lang="en">',
+            "<head>",
+            '<meta charset="utf-8">',
+            f'<meta http-equiv="Content-Security-Policy" content="{_policy(scripts)}">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            '<meta name="color-scheme" content="light dark">',
+            f"<title>{escape(title)}</title>",
+            f"<style>{css}</style>",
+            "</head>",
+            f"<body>{body}",
+            f'<script type="application/json" id="data">{data}</script>',
+            *[f"<script>{s}</script>" for s in scripts],
+            "</body>",
+            "</html>",
+            "",
+        ]
+    )
+
+
+def embed(data: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    text = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    return text.translate(_ESCAPES)
+
+
+def _policy(scripts: list[str]) -> str:
+    """Let nothing run but these scripts, and nothing be fetched.
+
+    Escaping already keeps data from becoming code; should it ever fail, the browser refuses.
+    """
+    hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    allowed = " ".join(f"'sha256-{h}'" for h in hashes)
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
+        "img-src data: blob:; base-uri 'none'; form-action 'none'"
+    )
+
+
+# -- layout -------------------------------------------------------------------------------------
+
+
+def _header(validations: Mapping[str, Validation], title: str) -> Markup:
+    names = {r.recorded.name for v in validations.values() for r in v.runs}
+    models = plural(len(validations), "fitted model")
+    lede = (
+        f"{models}, {plural(len(names), 'test run')}. Every model variant is simulated from the "
+        "recorded initial state with the recorded controls and disturbances of each test run, and "
+        "its states and outputs are compared with the recorded ones along its own rollout. Figures "
+        "in the tables come from all samples; the curves are thinned to about 5 Hz for display."
+    )
+    return element("header", element("h1", title), element("p", lede, cls="lede"))
+
+
+def _main(validations: Mapping[str, Validation]) -> Markup:
+    heads = [sections.headline(name, v) for name, v in validations.items()]
+    parts = [
+        _section("summary", "Summary", join(*heads), sections.glance(validations)),
+        _controls(),
+        _section("accuracy", "Accuracy", _per_model(validations, sections.accuracy)),
+        _section("series", "Time series", _figure("series-plot", "Time series", endings=True)),
+        _section(
+            "spectra",
+            "Power spectral densities",
+            element("p", _PSD_NOTE, element("span", id="bands"), cls="note"),
+            _figure("spectra-plot", "Power spectral densities"),
+            _per_run(validations, by_run.peaks),
+        ),
+        _section(
+            "errors",
+            "Error distribution",
+            element("p", _ERRORS_NOTE, cls="note"),
+            _figure("errors-plot", "Error histograms"),
+        ),
+        _section(
+            "loads",
+            "Ranges and loads",
+            _per_run(validations, by_run.ranges),
+            _per_run(validations, by_run.damage),
+        ),
+        _section(
+            "model",
+            "Inside the model",
+            _per_model(validations, sections.derivatives),
+            _per_model(validations, sections.decisions),
+            _figure("eigenvalues-plot", "Eigenvalues in the complex plane"),
+            _per_model(validations, sections.eigenvalues),
+            _per_model(validations, sections.times),
+        ),
+        _section("record", "Settings and data", _per_model(validations, sections.provenance)),
+    ]
+    return element("main", *parts)
+
+
+def _section(key: str, heading: str, *children: object) -> Markup:
+    return element("section", element("h2", heading), *children, id=key)
+
+
+def _controls() -> Markup:
+    """Choose what the figures and tables below show; page.js fills and shows it."""
+    return element(
+        "form",
+        element("label", "Fitted model ", element("select", id="pick-model")),
+        element("label", "Test run ", element("select", id="pick-run")),
+        element("fieldset", element("legend", "Curves"), id="pick-variants"),
+        element(
+            "fieldset",
+            element("legend", "Time (s)"),
+            element("input", id="from", type="number", step="any", aria_label="from, s"),
+            element("span", "to"),
+            element("input", id="to", type="number", step="any", aria_label="to, s"),
+            element("button", "All", id="whole", type="button"),
+        ),
+        id="controls",
+        hidden=True,
+        autocomplete="off",
+    )
+
+
+def _figure(key: str, label: str, endings: bool = False) -> Markup:
+    return element(
+        "figure",
+        element("figcaption", element("span", cls="context")),
+        element("div", id=key, cls="plot", role="img", aria_label=label),
+        element("ul", id="endings", cls="note") if endings else "",
+        element("noscript", "The figures need JavaScript; every figure in a table does not."),
+    )
+
+
+def _per_model(
+    validations: Mapping[str, Validation], part: Callable[[str, Validation], Markup]
+) -> Markup:
+    return join(
+        *[
+            element("div", part(name, v), data_model=i)
+            for i, (name, v) in enumerate(validations.items())
+        ]
+    )
+
+
+def _per_run(
+    validations: Mapping[str, Validation],
+    part: Callable[[str, Validation, RunComparison], Markup],
+) -> Markup:
+    return join(
+        *[
+            element("div", part(name, v, run), data_model=i, data_run=j)
+            for i, (name, v) in enumerate(validations.items())
+            for j, run in enumerate(v.runs)
+        ]
+    )

@@ -1,0 +1,437 @@
+// Draws the figures of the selected fitted model and test run, and shows their tables.
+// Names and units are data: the page gets them as text, Plotly (which reads tags in texts) escaped.
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const byId = (id) => document.getElementById(id);
+  const picks = { model: byId("pick-model"), run: byId("pick-run") };
+  const span = { from: byId("from"), to: byId("to") };
+  const hiddenVariants = new Set();
+  const narrow = window.matchMedia("(max-width: 700px)");
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  const coarse = window.matchMedia("(pointer: coarse)");
+
+  const safe = (text) =>
+    String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+  const array = (index) => ({ dtype: "f4", bdata: data.blobs[index] });
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const labelled = (name, unit) => "<b>" + safe(name) + "</b>" + (unit ? "  " + safe(unit) : "");
+  const squared = (unit) => (unit ? (/^[\w%]+$/.test(unit) ? unit : `(${unit})`) + "²/Hz" : "1/Hz");
+  const short = (value) => Number(value.toPrecision(5)).toString();
+
+  const model = () => data.models[Number(picks.model.value)];
+  const run = () => model().runs[Number(picks.run.value)];
+  const curve = (index) => css(`--curve-${(index % 5) + 1}`);
+
+  // Curves that coincide stay visible: the earlier ones are drawn wider and below.
+  const width = (index) => Math.max(2.4 - 0.65 * index, 1);
+
+  function node(tag, text, className) {
+    const made = document.createElement(tag);
+    if (text !== undefined) made.textContent = text;
+    if (className) made.className = className;
+    return made;
+  }
+
+  // -- stacked panels ---------------------------------------------------------------------------
+
+  const GAP = { top: 26, between: 46, shared: 30, bottom: 44 };
+
+  // One figure of panels, {label, traces, range, log, bands, x}; a shared x-axis is drawn once.
+  function panels(id, list, options) {
+    const columns = options.shared || narrow.matches ? 1 : Math.min(2, list.length);
+    const rows = Math.ceil(list.length / columns);
+    const gap = options.shared ? GAP.shared : GAP.between + GAP.top;
+    const inner = rows * options.height + (rows - 1) * gap;
+    const layout = base(inner + GAP.top + GAP.bottom, GAP.top, GAP.bottom);
+    const traces = [];
+    list.forEach((panel, k) => {
+      const [row, column] = [Math.floor(k / columns), k % columns];
+      const top = 1 - (row * (options.height + gap)) / inner;
+      const n = k === 0 ? "" : String(k + 1);
+      const xn = options.shared ? "" : n;
+      const left = column / columns + (column ? 0.04 : 0);
+      const right = (column + 1) / columns - (columns > 1 && !column ? 0.04 : 0);
+      const low = Math.max(0, top - options.height / inner);
+      layout["yaxis" + n] = axis({
+        domain: [low, top],
+        anchor: "x" + xn,
+        type: panel.log ? "log" : "linear",
+        range: panel.range,
+        nticks: panel.log ? 5 : 4,
+        exponentformat: panel.log ? "power" : "SI",
+        // Plotly enlarges powers of ten by a quarter.
+        tickfont: { color: css("--soft"), size: panel.log ? 9 : 11 },
+        ticksuffix: options.suffix || "",
+      });
+      if (!options.shared || k === 0) {
+        layout["xaxis" + xn] = axis({
+          domain: [left, right],
+          anchor: "y" + (options.shared && list.length > 1 ? list.length : n),
+          title: { text: safe(panel.x), standoff: 4, font: { size: 12 } },
+          range: options.range,
+          matches: options.matches && k > 0 ? "x" : undefined,
+          nticks: narrow.matches ? 6 : undefined,
+        });
+      }
+      layout.annotations.push({
+        text: panel.label,
+        xref: "paper",
+        yref: "paper",
+        x: left,
+        y: top,
+        xanchor: "left",
+        yanchor: "bottom",
+        showarrow: false,
+        font: { size: 12.5, color: css("--ink") },
+      });
+      for (const [low_, high, colour] of panel.bands || []) {
+        layout.shapes.push({
+          type: "rect",
+          layer: "below",
+          xref: "x" + xn,
+          yref: `y${n} domain`,
+          x0: low_,
+          x1: high,
+          y0: 0,
+          y1: 1,
+          fillcolor: colour,
+          line: { width: 0 },
+        });
+      }
+      for (const t of panel.traces) traces.push({ ...t, xaxis: "x" + xn, yaxis: "y" + n });
+    });
+    layout.hovermode = "x unified";
+    return draw(id, traces, layout);
+  }
+
+  function base(height, top, bottom) {
+    return {
+      height,
+      margin: { l: narrow.matches ? 46 : 58, r: 10, t: top, b: bottom },
+      paper_bgcolor: "rgba(0,0,0,0)",
+      plot_bgcolor: "rgba(0,0,0,0)",
+      font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: css("--ink") },
+      hoverlabel: { bgcolor: css("--panel"), bordercolor: css("--rule"), namelength: -1 },
+      modebar: {
+        bgcolor: "rgba(0,0,0,0)",
+        color: css("--soft"),
+        activecolor: css("--ink"),
+      },
+      showlegend: false,
+      dragmode: coarse.matches ? false : "zoom",
+      annotations: [],
+      shapes: [],
+    };
+  }
+
+  function axis(extra) {
+    return {
+      gridcolor: css("--faint"),
+      linecolor: css("--rule"),
+      zerolinecolor: css("--rule"),
+      tickcolor: css("--rule"),
+      tickfont: { color: css("--soft"), size: 11 },
+      showline: true,
+      ticks: "outside",
+      ticklen: 3,
+      ...extra,
+    };
+  }
+
+  function draw(id, traces, layout) {
+    return window.Plotly.react(byId(id), traces, layout, {
+      responsive: true,
+      displaylogo: false,
+      doubleClick: "reset",
+      modeBarButtons: [["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
+    });
+  }
+
+  function nothing(id, text) {
+    const place = byId(id);
+    if (window.Plotly && place.classList.contains("js-plotly-plot")) window.Plotly.purge(place);
+    place.replaceChildren(node("p", text, "note"));
+  }
+
+  function clear(id) {
+    const place = byId(id);
+    if (!place.classList.contains("js-plotly-plot")) place.replaceChildren();
+  }
+
+  const line = (name, colour, width) => ({
+    type: "scatter",
+    mode: "lines",
+    name: safe(name),
+    line: { color: colour, width },
+    hoverlabel: { namelength: -1 },
+  });
+  const shown = () =>
+    model()
+      .variants.map((name, i) => [name, i])
+      .filter(([name]) => !hiddenVariants.has(name));
+
+  // -- figures ----------------------------------------------------------------------------------
+
+  function drawSeries() {
+    const r = run();
+    const list = model().channels.map((channel, c) => {
+      const range = r.ranges[c];
+      const at = (s, name, colour, width) => ({
+        ...line(name, colour, width),
+        y: array(s.y[c]),
+        x0: s.t0,
+        dx: s.dt,
+        hovertemplate: "%{y:.5~g}",
+      });
+      const traces = [at(r.recorded, "recorded", css("--recorded"), 1.6)];
+      for (const [name, i] of shown()) {
+        const s = r.variants[name];
+        traces.push(at(s, name, curve(i), width(i)));
+        if (s.ended !== null) traces.push(ending(s, name, c, range, curve(i)));
+      }
+      return { label: labelled(channel.name, channel.unit), traces, range, x: "time (s)" };
+    });
+    panels("series-plot", list, { shared: true, height: 120, range: window_() });
+    const notes = shown()
+      .filter(([name]) => r.variants[name].ended !== null)
+      .map(([name, i]) => {
+        const s = r.variants[name];
+        const [item, mark] = [node("li"), node("b", "× ")];
+        mark.style.color = curve(i);
+        item.append(mark, `${name} ended at ${short(s.ended)} s: ${s.message}`);
+        return item;
+      });
+    byId("endings").replaceChildren(...notes);
+  }
+
+  // The last point of a rollout may lie far outside the panel; its mark stays inside.
+  function ending(s, name, c, range, colour) {
+    const margin = 0.04 * (range[1] - range[0]);
+    const y = Math.min(Math.max(s.last[c], range[0] + margin), range[1] - margin);
+    return {
+      type: "scatter",
+      mode: "markers",
+      x: [s.ended],
+      y: [y],
+      name: safe(name),
+      marker: { symbol: "x", size: 9, color: colour, line: { color: css("--paper"), width: 1 } },
+      hovertemplate: "ended",
+    };
+  }
+
+  function drawSpectra() {
+    const r = run();
+    const bands = r.bands.map((b, i) => [b.low, b.high, css(`--band-${(i % 3) + 1}`)]);
+    const list = model().channels.map((channel, c) => {
+      const at = (s, name, colour, width) => ({
+        ...line(name, colour, width),
+        y: array(s.psd[c]),
+        x0: 0,
+        dx: s.df,
+        hovertemplate: "%{y:.3~g}",
+      });
+      const traces = [at(r.recorded, "recorded", css("--recorded"), 1.8)];
+      for (const [name, i] of shown()) {
+        if (r.variants[name].psd) traces.push(at(r.variants[name], name, curve(i), width(i)));
+      }
+      return {
+        label: labelled(channel.name, squared(channel.unit)),
+        traces,
+        log: true,
+        bands,
+        x: "frequency (Hz)",
+      };
+    });
+    panels("spectra-plot", list, { height: 170, range: [0, 1], matches: true });
+    const legend = [node("span", "Shaded:")];
+    r.bands.forEach((b, i) => {
+      const patch = node("span", "", "patch");
+      patch.style.background = css(`--band-${(i % 3) + 1}`);
+      legend.push(patch, node("span", `${b.name} ${b.low.toPrecision(2)}–${b.high.toPrecision(2)} Hz`));
+    });
+    const unfinished = shown().filter(([name]) => !r.variants[name].psd);
+    if (unfinished.length) {
+      const names = unfinished.map(([name]) => name).join(", ");
+      legend.push(node("span", `. Not drawn, rollout unfinished: ${names}.`));
+    }
+    byId("bands").replaceChildren(...legend);
+  }
+
+  function drawErrors() {
+    const m = model();
+    const list = [];
+    m.histograms.forEach((h, c) => {
+      if (!h) return;
+      const { name, unit } = m.channels[c];
+      const traces = shown().map(([variant, i]) => ({
+        ...line(variant, curve(i), width(i)),
+        line: { color: curve(i), width: width(i), shape: "hvh" },
+        x: array(h.x),
+        y: array(h.share[variant]),
+        hovertemplate: "%{y:.2f}",
+      }));
+      list.push({ label: labelled(name), traces, x: unit ? `error (${unit})` : "error" });
+    });
+    if (!list.length) {
+      nothing("errors-plot", "No test run was completed by every variant, so there is nothing to compare.");
+      return;
+    }
+    clear("errors-plot");
+    panels("errors-plot", list, { height: 150, suffix: " %" });
+  }
+
+  function drawEigenvalues() {
+    const m = model();
+    const points = [];
+    for (const e of m.eigenvalues) {
+      e.real.forEach((x, i) => points.push({ x, y: e.imag[i], s: e.schedule }));
+    }
+    const many = m.schedule !== null && m.eigenvalues.length > 1;
+    const trace = (unstable, name, symbol) => {
+      const some = points.filter((p) => p.x > 0 === unstable);
+      const colour = unstable ? css("--bad") : css("--curve-1");
+      return {
+        type: "scatter",
+        mode: "markers",
+        name,
+        x: some.map((p) => p.x),
+        y: some.map((p) => p.y),
+        customdata: some.map((p) => p.s),
+        marker: { symbol, size: unstable ? 9 : 8, color: colour, line: { width: 1.5, color: colour } },
+        hovertemplate:
+          "%{x:.4~g} 1/s, %{y:.4~g} rad/s" + (many ? "<br>schedule %{customdata:.4~g}" : ""),
+      };
+    };
+    const layout = base(340, 12, 46);
+    layout.margin.l = 58;
+    layout.xaxis = axis({ title: { text: "real part (1/s)", standoff: 4 } });
+    layout.yaxis = axis({ title: { text: "imaginary part (rad/s)", standoff: 4 } });
+    layout.hovermode = "closest";
+    layout.showlegend = true;
+    layout.legend = { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" };
+    layout.margin.t = 34;
+    layout.shapes.push({
+      type: "line",
+      xref: "x",
+      yref: "paper",
+      x0: 0,
+      x1: 0,
+      y0: 0,
+      y1: 1,
+      line: { color: css("--soft"), width: 1, dash: "dot" },
+    });
+    const traces = [trace(false, "stable", "circle-open"), trace(true, "unstable", "x-thin")];
+    draw("eigenvalues-plot", traces.filter((t) => t.x.length), layout);
+  }
+
+  // -- selection --------------------------------------------------------------------------------
+
+  function window_() {
+    const r = run();
+    const value = (input, fallback) => (input.value === "" ? fallback : Number(input.value));
+    const [from, to] = [value(span.from, r.start), value(span.to, r.stop)];
+    return from < to ? [from, to] : [r.start, r.stop];
+  }
+
+  function fill(select, names) {
+    const before = select.value;
+    select.replaceChildren(
+      ...names.map((name, i) => {
+        const option = node("option", name);
+        option.value = String(i);
+        return option;
+      }),
+    );
+    if (before !== "" && Number(before) < names.length) select.value = before;
+  }
+
+  function fillVariants() {
+    const place = byId("pick-variants");
+    const swatch = (colour) => {
+      const made = node("span", "", "swatch");
+      made.style.borderTopColor = colour;
+      return made;
+    };
+    const reference = node("label");
+    reference.append(swatch(css("--recorded")), node("span", "recorded"));
+    const boxes = model().variants.map((name, i) => {
+      const label = node("label");
+      const box = node("input");
+      box.type = "checkbox";
+      box.checked = !hiddenVariants.has(name);
+      box.addEventListener("change", () => {
+        if (box.checked) hiddenVariants.delete(name);
+        else hiddenVariants.add(name);
+        redraw();
+      });
+      label.append(box, swatch(curve(i)), node("span", name));
+      return label;
+    });
+    place.replaceChildren(place.querySelector("legend"), reference, ...boxes);
+  }
+
+  function showTables() {
+    const [m, r] = [picks.model.value, picks.run.value];
+    for (const part of document.querySelectorAll("[data-model]")) {
+      const { model: ofModel, run: ofRun } = part.dataset;
+      part.hidden = ofModel !== m || (ofRun !== undefined && ofRun !== r);
+    }
+    const perRun = new Set(["series-plot", "spectra-plot"]);
+    for (const figure of document.querySelectorAll("figure")) {
+      const parts = [model().name];
+      if (perRun.has(figure.querySelector(".plot").id)) parts.push(run().name);
+      figure.querySelector(".context").textContent = parts.join(", ");
+    }
+  }
+
+  function redraw() {
+    drawSeries();
+    drawSpectra();
+    drawErrors();
+    drawEigenvalues();
+  }
+
+  function select() {
+    fill(picks.run, model().runs.map((r) => r.name));
+    fillVariants();
+    showTables();
+    span.from.placeholder = short(run().start);
+    span.to.placeholder = short(run().stop);
+    redraw();
+  }
+
+  function restyle() {
+    fillVariants();
+    redraw();
+  }
+
+  // Print in light colours and at the width of a page, whatever the screen shows.
+  function print(on) {
+    document.documentElement.classList.toggle("printing", on);
+    restyle();
+    for (const plot of document.querySelectorAll(".js-plotly-plot")) {
+      window.Plotly.relayout(plot, on ? { width: 680 } : { width: null, autosize: true });
+    }
+  }
+
+  fill(picks.model, data.models.map((m) => m.name));
+  picks.model.addEventListener("change", select);
+  picks.run.addEventListener("change", select);
+  for (const input of [span.from, span.to]) {
+    input.addEventListener("change", () =>
+      window.Plotly.relayout(byId("series-plot"), { "xaxis.range": window_() }),
+    );
+  }
+  byId("whole").addEventListener("click", () => {
+    span.from.value = span.to.value = "";
+    drawSeries();
+  });
+  byId("controls").addEventListener("submit", (event) => event.preventDefault());
+  byId("controls").hidden = false;
+  narrow.addEventListener("change", redraw);
+  dark.addEventListener("change", restyle);
+  window.addEventListener("beforeprint", () => print(true));
+  window.addEventListener("afterprint", () => print(false));
+  select();
+})();

@@ -1,0 +1,173 @@
+"""The commented `config.yaml` that `dfsm init` writes, filled with the channels it found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+from dfsm.files import write_file
+from dfsm.read import describe, read_all
+from dfsm.read.info import ChannelInfo
+from dfsm.trajectory import Trajectory
+
+# What wind engineers usually choose, in order of preference; only names that exist are proposed.
+_STATES = ("PtfmPitch", "GenSpeed", "RotSpeed")
+_CONTROLS = ("GenTq", "BldPitch1")
+_OUTPUTS = ("TwrBsFxt", "TwrBsMyt", "GenPwr")
+_WINDS = ("RotWind", "RtVAvgxh", "Wind1VelX")
+_WITH_WIND = ("RotShearV", "RotShearH", "Wave1Elev")
+# A start-up transient is dropped from runs that are clearly longer than it.
+_TRANSIENT = 100.0
+_HUB_HEIGHT = 150.0
+
+_TEXT = """\
+# dfsm configuration. Next: dfsm fit {name} -o model/
+
+data:
+  train:{train}
+  start: {start}      # s; earlier samples (the start-up transient) are not used
+  stop: null       # s
+  hub_height: {hub_height}   # m; a number adds the channel RtVAvgxhCorr to every run
+
+# Channels found (unit, range over the first run{constant}):
+{channels}
+
+signals:
+  # order 2: the channel and its rate are both states, ξ = [q, q̇]. A recorded rate is used
+  # instead of a derivative with rate: <channel> (and acceleration: <channel>).
+  states:{states}
+  controls: {controls}        # what an optimiser may choose
+  # Known signals that nobody chooses. None of them may hold a response of the turbine.{wind_note}
+  disturbances: {disturbances}
+  parameters: []       # plant variables, constant within a run
+  outputs: {outputs}
+
+derivatives:
+  method: smoothing_spline     # or cubic_spline, as in the paper
+  # filters: {{GenSpeed: {{kind: low_pass, cutoff: 0.5}}}}
+
+linear:
+{linear}
+
+corrective:
+  kind: rbf           # rbf, rbf_incremental, gp, mlp or none
+  samples: 200        # units
+  sampling: kmeans    # kmeans, maxmin or random
+  targets: all        # or cluster_means, as in the paper
+
+gate: 0.02            # correct a row only if its residual exceeds this share of the signal
+azimuth: {azimuth}
+nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in the report
+seed: 0
+"""
+
+
+def write_config(files: Sequence[str], path: Path) -> None:
+    """Write a configuration for the given runs.
+
+    Parameters
+    ----------
+    files
+        Result files or patterns; they become ``data.train``.
+    path
+        File to write; relative patterns are rewritten to start from its folder.
+
+    Raises
+    ------
+    DfsmError
+        A file cannot be read, or `path` not written.
+    """
+    runs = read_all(files)
+    text = fill(runs, _relative([r.source or r.name for r in runs], path.parent), path.name)
+    with write_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
+    """Fill the template with channels that all runs share."""
+    first = describe(runs[0])
+    common = set(runs[0].names).intersection(*(r.names for r in runs))
+    varying = {
+        c.name: c
+        for c in first.channels
+        if c.name in common and any(r[c.name].min() < r[c.name].max() for r in runs)
+    }
+    wind = next((w for w in _WINDS if w in varying), None)
+    states = [s for s in _STATES if s in varying]
+    states = states[:-1] if {"GenSpeed", "RotSpeed"} <= set(states) else states
+    disturbances = ([wind] if wind else []) + [d for d in _WITH_WIND if d in varying]
+    long = min(r.time[-1] for r in runs) > 2 * _TRANSIENT + runs[0].time[0]
+    relative = wind == "RtVAvgxh"
+    return _TEXT.format(
+        name=name,
+        train=_block(train),
+        start=_TRANSIENT if long else "null",
+        hub_height="null",
+        constant="" if len(varying) == len(first.channels) else "; constant ones left out",
+        channels="\n".join(_comment(c) for c in varying.values()),
+        states=_block([{"name": s, "order": 2} for s in states]),
+        controls=_flow([c for c in _CONTROLS if c in varying]),
+        wind_note=_WIND_NOTE if relative else "",
+        disturbances=_flow(disturbances),
+        outputs=_flow([o for o in _OUTPUTS if o in varying]),
+        linear=_LPV.format(schedule=_flow(wind)) if wind else "  kind: LTI",
+        azimuth=_azimuth(states, varying),
+    )
+
+
+_WIND_NOTE = """
+  # RtVAvgxh is measured on the moving rotor and holds the platform's motion, a response: use the
+  # undisturbed rotor average of the wind field if you have it, or set data.hub_height and
+  # replace RtVAvgxh by RtVAvgxhCorr here and in linear.schedule."""
+
+_LPV = """\
+  kind: LPV           # LPV: coefficients vary with the schedule; LTI: they do not
+  schedule: {schedule}
+  points: 5"""
+
+
+def _azimuth(states: Sequence[str], varying: dict[str, ChannelInfo]) -> str:
+    speed = next((s for s in ("RotSpeed", "GenSpeed") if s in states), None)
+    if speed is None or "LSSTipPxa" not in varying:
+        return "null         # {speed: <state>, angle: <channel>} adds blade-passing (3P) inputs"
+    return (
+        f"{{speed: {speed}, angle: LSSTipPxa}}  # blade-passing (3P) inputs of the outputs; speed "
+        "must be the rotor's"
+    )
+
+
+def _comment(channel: ChannelInfo) -> str:
+    # A line break in a name must not end the comment.
+    name = channel.name.encode("unicode_escape").decode("ascii")
+    unit = channel.unit.encode("unicode_escape").decode("ascii")
+    return f"#   {name:<16} {unit:<10} {channel.min:.5g} to {channel.max:.5g}"
+
+
+def _block(items: Sequence[object]) -> str:
+    """A YAML list with one item per line, to follow a key and its colon."""
+    if not items:
+        return " []"
+    return "".join(f"\n    - {_flow(item)}" for item in items)
+
+
+def _flow(value: object) -> str:
+    """A value as YAML on one line."""
+    yaml = YAML()
+    yaml.default_flow_style = True
+    yaml.width = 10_000
+    stream = StringIO()
+    yaml.dump(value, stream)
+    return stream.getvalue().removesuffix("...\n").strip()
+
+
+def _relative(files: Sequence[str], folder: Path) -> list[str]:
+    """File names relative to the folder of the configuration, where they lie below it."""
+    base = folder.resolve()
+    found = []
+    for file in files:
+        path = Path(file).resolve()
+        found.append(str(path.relative_to(base)) if path.is_relative_to(base) else str(path))
+    return found

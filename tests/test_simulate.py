@@ -1,0 +1,337 @@
+"""Rollouts against solve_ivp and closed forms, and how they end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
+from systems import OSCILLATOR_A, driving_run, linear_model, wander
+
+from dfsm import integrate
+from dfsm.corrective import GaussianUnits
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.signals import Azimuth
+from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
+from dfsm.trajectory import Channel, Trajectory
+
+B = np.array([[0.0], [2.0]])
+CENTRES = np.random.default_rng(0).normal(size=(5, 3))
+WEIGHTS = np.random.default_rng(1).normal(size=(5, 1))
+BUMPS = GaussianUnits(
+    shift=jnp.zeros(3),
+    scale=jnp.full(3, 2.0),
+    centres=jnp.asarray(CENTRES),
+    weights=jnp.asarray(WEIGHTS),
+    bias=jnp.zeros(1),
+)
+C = np.array([[1.0, 2.0]])
+MODEL = linear_model(OSCILLATOR_A, B, C, np.array([[0.5]]), corrective=BUMPS)
+X0 = np.array([0.5, -0.3])
+
+
+def slope(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The same f written down in NumPy."""
+    z = np.array([*u, *x]) / 2.0
+    e = np.exp(-((CENTRES - z) ** 2).sum(1)) @ WEIGHTS
+    return OSCILLATOR_A @ x + B @ u + np.array([0.0, e[0]])
+
+
+def reference(time: np.ndarray, drive) -> np.ndarray:
+    """Solve interval by interval, so that no step crosses a kink of the inputs."""
+    states = [X0]
+    for a, b in zip(time[:-1], time[1:], strict=True):
+        found = solve_ivp(
+            lambda t, x: slope(x, drive(t)), (a, b), states[-1], rtol=1e-11, atol=1e-12
+        )
+        states.append(found.y[:, -1])
+    return np.array(states)
+
+
+def inputs_at(time: np.ndarray, seed: int = 0) -> np.ndarray:
+    return wander(np.random.default_rng(seed), 0.5, 3.0, 2.0)(time)[:, None]
+
+
+def recorded(time: np.ndarray, seed: int = 0, model=MODEL) -> Trajectory:
+    states = np.tile(X0, (len(time), 1))
+    return driving_run(model, time, inputs_at(time, seed), states, f"run{seed}")
+
+
+def states_of(result: Simulation) -> np.ndarray:
+    return result.trajectory.values[:, :2]
+
+
+def error(time: np.ndarray, truth: np.ndarray, **options) -> float:
+    result = simulate(MODEL, recorded(time), options=SimulationSettings(**options))
+    assert result.status is Status.COMPLETED
+    np.testing.assert_array_equal(result.trajectory.time, time)
+    return float(np.abs(states_of(result) - truth).max())
+
+
+EVEN = np.linspace(0, 12, 61)
+IRREGULAR = np.sort(np.concatenate([[0, 12], np.random.default_rng(2).uniform(0, 12, 70)]))
+
+
+@pytest.fixture(scope="module", params=["even", "irregular"])
+def solved(request):
+    time = EVEN if request.param == "even" else IRREGULAR
+    u = inputs_at(time)[:, 0]
+    return time, reference(time, lambda t: np.array([np.interp(t, time, u)]))
+
+
+# -- accuracy -----------------------------------------------------------------------------------
+
+
+def test_rk4_is_accurate_and_of_fourth_order(solved):
+    time, truth = solved
+    errors = [error(time, truth, step=h) for h in (0.2, 0.1, 0.05, 0.025)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert errors[-1] < 1e-6
+    # An irregular mesh divides its longest interval, so that halving the step is not exact.
+    assert ((orders > 3.3) & (orders < 5.0)).all(), (errors, orders)
+
+
+@pytest.mark.parametrize("method", ["tsit5", "kvaerno5"])
+def test_adaptive_methods_meet_their_tolerance(solved, method):
+    time, truth = solved
+    loose = error(time, truth, method=method, rtol=1e-4, atol=1e-6)
+    tight = error(time, truth, method=method, rtol=1e-9, atol=1e-11)
+    assert tight < 1e-6
+    assert tight < loose < 1e-2
+
+
+def test_outputs_follow_the_rollout():
+    result = simulate(MODEL, recorded(EVEN))
+    y = states_of(result) @ C[0] + 0.5 * inputs_at(EVEN)[:, 0]
+    np.testing.assert_allclose(result.trajectory["y0"], y, rtol=1e-12, atol=1e-12)
+    assert [c.role for c in result.trajectory.channels] == ["state", "state", "output"]
+    assert result.trajectory.channel("y0").unit == "kN"
+
+
+def test_cubic_inputs_follow_a_smooth_signal_better_than_linear_ones():
+    time = np.linspace(0, 12, 41)
+    true = reference(time, lambda t: inputs_at(np.array([t]))[0])
+    linear = error(time, true, step=0.02, interpolation="linear")
+    cubic = error(time, true, step=0.02, interpolation="cubic")
+    assert cubic < linear / 5
+    spline = CubicSpline(time, inputs_at(time)[:, 0])
+    assert error(time, reference(time, lambda t: np.array([spline(t)])), step=0.01,
+                 interpolation="cubic") < 1e-6  # fmt: skip
+
+
+def test_a_batch_gives_what_single_runs_give():
+    times = (EVEN, EVEN[:20], IRREGULAR, np.linspace(3, 40, 1500))
+    runs = [recorded(t, seed) for seed, t in enumerate(times)]
+    for result, run in zip(simulate(MODEL, runs), runs, strict=True):
+        alone = simulate(MODEL, run)
+        assert result.trajectory.name == run.name
+        np.testing.assert_array_equal(result.trajectory.time, run.time)
+        np.testing.assert_allclose(
+            result.trajectory.values, alone.trajectory.values, rtol=1e-10, atol=1e-11
+        )
+
+
+@pytest.mark.parametrize("method", ["rk4", "kvaerno5"])
+def test_a_given_initial_state_replaces_the_recorded_one(method):
+    options = SimulationSettings(method=method)
+    run = recorded(EVEN).select(["u0"])
+    result = simulate(MODEL, run, initial=X0, options=options)
+    same = simulate(MODEL, recorded(EVEN), options=options)
+    np.testing.assert_array_equal(result.trajectory.values, same.trajectory.values)
+
+
+# -- stiffness, instability, range --------------------------------------------------------------
+
+STIFF_A = np.array([[-2000.0, 1999.0], [0.0, -1.0]])
+
+
+def stiff_run(model) -> Trajectory:
+    time = np.linspace(0, 20, 401)
+    return driving_run(model, time, np.zeros((401, 1)), np.tile([1.0, -1.0], (401, 1)))
+
+
+def test_a_stiff_model_needs_the_stiff_method():
+    model = linear_model(STIFF_A, np.array([[0.0], [1.0]]))
+    run = stiff_run(model)
+    with pytest.warns(DfsmWarning, match="run: x0 reached"):
+        explicit = simulate(model, run)
+    assert explicit.status in (Status.LEFT_REGION, Status.NOT_FINITE)
+    assert explicit.ended < 1
+    implicit = simulate(model, run, options=SimulationSettings(method="kvaerno5"))
+    assert implicit.status is Status.COMPLETED
+    exact = np.array([expm(STIFF_A * t) @ [1.0, -1.0] for t in run.time])
+    np.testing.assert_allclose(states_of(implicit), exact, rtol=0, atol=1e-4)
+
+
+def test_steps_so_large_that_numbers_overflow_are_told():
+    model = linear_model(1e60 * STIFF_A, np.array([[0.0], [1.0]]))
+    with pytest.warns(DfsmWarning):
+        result = simulate(model, stiff_run(model))
+    assert result.status is not Status.COMPLETED
+    hot = linear_model(np.array([[1e200, 0.0], [0.0, 1e200]]), np.array([[0.0], [1.0]]))
+    with pytest.warns(DfsmWarning, match="no longer finite: use a smaller step or a stiff method"):
+        result = simulate(hot, stiff_run(hot))
+    assert result.status is Status.NOT_FINITE
+
+
+def test_a_solver_that_gives_up_is_told(monkeypatch):
+    monkeypatch.setattr(integrate, "_MAX_STEPS", 50)
+    model = linear_model(STIFF_A, np.array([[0.0], [1.0]]), names=["hard", "soft"])
+    with pytest.warns(DfsmWarning, match="the adaptive solver gave up"):
+        result = simulate(model, stiff_run(model), options=SimulationSettings(method="tsit5"))
+    assert result.status is Status.SOLVER_FAILED
+    assert np.isfinite(result.trajectory.values).all()
+    assert result.ended < 1
+
+
+def test_an_unstable_model_stops_where_a_state_leaves_by_a_factor_of_ten():
+    A = np.array([[0.5, 0.0], [0.0, -1.0]])
+    model = linear_model(
+        A, np.array([[0.0], [1.0]]), names=["speed", "pitch"], units=["rpm", "deg"], span=1.0
+    )
+    time = np.linspace(0, 30, 301)
+    run = driving_run(model, time, np.zeros((301, 1)), np.tile([0.1, 0.1], (301, 1)), "storm")
+    with pytest.warns(DfsmWarning, match=r"storm: speed reached 10\.\d+ rpm at 9\.3 s"):
+        result = simulate(model, run)
+    # 0.1 exp(t/2) = 10 at t = 9.21: the next sample is the first beyond.
+    assert result.status is Status.LEFT_REGION
+    assert 9.1 <= result.ended <= 9.3
+    assert result.trajectory.time[-1] == result.ended
+    assert "training range -1 to 1" in result.reason
+    exact = 0.1 * np.exp(result.trajectory.time / 2)
+    np.testing.assert_allclose(result.trajectory["speed"], exact, rtol=1e-6)
+
+
+def test_the_share_outside_the_training_range_is_told():
+    A = -np.eye(2)
+    model = linear_model(A, np.array([[0.0], [1.0]]), span=1.0)
+    time = np.linspace(0, 10, 101)
+    u = np.where(time < 8, 0.0, 1.5)[:, None]
+    run = driving_run(model, time, u, np.zeros((101, 2)), "gust")
+    with pytest.warns(DfsmWarning, match=r"1 of 1 rollouts .* gust most \(20\.8%\)"):
+        result = simulate(model, run)
+    assert result.status is Status.COMPLETED
+    np.testing.assert_allclose(result.outside, 21 / 101, rtol=1e-12)
+    assert "20.8% of the time outside" in result.message
+
+
+def test_inside_the_range_nothing_is_warned():
+    assert simulate(MODEL, recorded(EVEN)).outside == 0  # any warning is an error here
+
+
+# -- what drives a rollout ----------------------------------------------------------------------
+
+SECOND = linear_model(OSCILLATOR_A, B, C, names=["q", "q_dot"], order=2)
+
+
+def motion(model, tail: float | None = None, after: float = 0.0) -> Trajectory:
+    """A run whose recorded states are something smooth, and something else after a time."""
+    time = np.linspace(0, 60, 1201)
+    q = np.stack([np.sin(time), np.cos(time)], axis=1)
+    if tail is not None:
+        q[time > after] = tail * np.random.default_rng(0).normal(
+            size=(int((time > after).sum()), 2)
+        )
+    columns = q if model is MODEL else q[:, :1]
+    return driving_run(model, time, inputs_at(time), columns)
+
+
+@pytest.mark.parametrize(
+    ("model", "start", "after"),
+    [
+        pytest.param(MODEL, None, 0.0, id="first order, from the start of the record"),
+        pytest.param(MODEL, 30.0, 30.0, id="first order, with history"),
+        pytest.param(SECOND, 30.0, 30.0, id="rates, with history"),
+        pytest.param(SECOND, None, 1.01, id="rates, from the record's first second"),
+    ],
+)
+def test_recorded_states_after_the_start_change_nothing(model, start, after):
+    honest = simulate(model, motion(model), start=start)
+    altered = simulate(model, motion(model, 5.0, after), start=start)
+    np.testing.assert_array_equal(honest.trajectory.values, altered.trajectory.values)
+    moved = simulate(model, motion(model, 5.0, after - 2.0), start=start) if start else None
+    assert moved is None or (moved.trajectory.values != honest.trajectory.values).any()
+
+
+def test_initial_rates_come_from_the_record():
+    result = simulate(SECOND, motion(SECOND), start=30.0)
+    # The last sample of a spline's record is where its derivative is least certain.
+    np.testing.assert_allclose(result.trajectory["q"][0], np.sin(30.0), atol=1e-4)
+    np.testing.assert_allclose(result.trajectory["q_dot"][0], np.cos(30.0), atol=2e-2)
+    assert result.trajectory.time[0] == 30.0
+
+
+def test_a_recorded_rate_is_used_as_it_stands():
+    spec = replace(SECOND.signals.specs[0], rate="gyro")
+    model = replace(SECOND, signals=replace(SECOND.signals, specs=(spec,)))
+    time = np.linspace(0, 10, 201)
+    values = np.stack([np.sin(time), 7 + time, inputs_at(time)[:, 0]], axis=1)
+    run = Trajectory(time, values, (Channel("q", "m"), Channel("gyro"), Channel("u0", "N")))
+    result = simulate(model, run, start=5.0)
+    np.testing.assert_array_equal(result.trajectory.values[0, :2], [np.sin(5.0), 12.0])
+
+
+# -- blade passing ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("rpm", np.pi / 30), ("rad/s", 1), ("deg/s", None)])
+@pytest.mark.parametrize("method", ["rk4", "tsit5"])
+def test_azimuth_turns_with_the_speed(unit, factor, method):
+    factor = np.pi / 180 if factor is None else factor
+    model = linear_model(
+        np.zeros((1, 1)),
+        np.array([[0.0]]),
+        np.zeros((1, 1)),
+        names=["speed"],
+        units=[unit],
+        azimuth=Azimuth(speed="speed", angle="psi"),
+    )
+    time = np.linspace(10, 40, 301)
+    values = np.stack([np.full(301, 7.5), np.full(301, 0.0), np.full(301, 33.0)], axis=1)
+    run = Trajectory(time, values, (Channel("speed", unit), Channel("u0"), Channel("psi", "deg")))
+    result = simulate(model, run, options=SimulationSettings(method=method))
+    psi = np.deg2rad(33.0) + 7.5 * factor * (time - 10)
+    np.testing.assert_allclose(result.trajectory["y0"], np.cos(3 * psi), rtol=0, atol=1e-9)
+
+
+def test_azimuth_speed_must_be_a_rotational_speed_among_the_states():
+    model = linear_model(
+        np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), names=["speed"], units=["m"],
+        azimuth=Azimuth(speed="speed"),
+    )  # fmt: skip
+    run = driving_run(model, EVEN, np.zeros((61, 1)), np.ones((61, 1)))
+    with pytest.raises(DfsmError, match="'speed' is in 'm', expected one of rpm, rad/s, deg/s"):
+        simulate(model, run)
+    wrong = replace(model, signals=replace(model.signals, azimuth=Azimuth(speed="sped")))
+    with pytest.raises(DfsmError, match="'sped', which is not a state; did you mean 'speed'"):
+        simulate(wrong, run)
+
+
+# -- bad input ----------------------------------------------------------------------------------
+
+
+def test_bad_runs_are_refused():
+    run = recorded(EVEN)
+    with pytest.raises(DfsmError, match="no runs were given to simulate"):
+        simulate(MODEL, [])
+    with pytest.raises(DfsmError, match=r"runs/run0\.csv: runs from 0 s to 12 s, shorter than"):
+        simulate(MODEL, run, start=20.0)
+    with pytest.raises(DfsmError, match=r"runs/run0\.csv: no channel 'u0'; did you mean 'u00'"):
+        simulate(MODEL, replace(run, channels=(*run.channels[:2], Channel("u00"))))
+    for column, name in ((2, "u0"), (0, "x0")):
+        values = run.values.copy()
+        values[0, column] = np.nan
+        with pytest.raises(DfsmError, match=f"channel '{name}' has 1 NaN or infinite"):
+            simulate(MODEL, replace(run, values=values))
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(DfsmError, match=r"initial has shape \(3,\), expected \(2,\) or \(1, 2\)"):
+        simulate(MODEL, recorded(EVEN), initial=[1.0, 2.0, 3.0])
+    for step in (0.0, -0.1, np.nan):
+        with pytest.raises(DfsmError, match="simulation step"):
+            SimulationSettings(step=step)
