@@ -111,12 +111,12 @@ OSCILLATOR = System(
 OSCILLATOR_A = np.array([[0, 1], [-4, -0.6]])
 OSCILLATOR_B = np.array([[0, 0], [2, 0.5]])
 
-# A driven pendulum: only q̈ and y are nonlinear; z = q + v is a linear output.
-PENDULUM = System(
+# A hardening spring: only q̈ and y are nonlinear; z = q + v is a linear output.
+DUFFING = System(
     (Q, V),
     (U, W),
     (Y, Channel("z", "m")),
-    f=lambda x, v: np.stack([x[1], -3 * np.sin(2 * x[0]) - 0.8 * x[1] + 2 * v[0] + 0.5 * v[1]]),
+    f=lambda x, v: np.stack([x[1], -2 * x[0] - 3 * x[0] ** 3 - 0.8 * x[1] + 2 * v[0] + 0.5 * v[1]]),
     g=lambda x, v: np.stack([x[0] ** 2 + 0.1 * v[0], x[0] + x[1]]),
 )
 

@@ -29,12 +29,16 @@ def damage_equivalent_load(
     Returns
     -------
     float
-        ``(Σ n_i S_i^m / (frequency duration))^(1/m)`` in the unit of the load; half cycles that
-        remain after counting enter as the counting algorithm closes them.
+        ``(Σ n_i S_i^m / (frequency duration))^(1/m)`` in the unit of the load; cycles are those
+        of the history repeated end to end, so that no half cycles remain.
     """
     if np.ptp(values) == 0:
         return 0.0
-    ranges = np.asarray(fatpack.find_rainflow_ranges(values, k=256))
+    # From its maximum to its maximum nothing remains open after counting (ASTM E1049, 5.4.5);
+    # fatpack alone loses the largest cycle of a history that begins or ends at an extreme.
+    peak = int(np.argmax(values))
+    closed = np.concatenate([values[peak:], values[: peak + 1]])
+    ranges = np.asarray(fatpack.find_rainflow_ranges(closed, k=256))
     # Divided by the largest range before the power, or m = 10 overflows in N m.
     largest = ranges.max()
     damage = np.sum((ranges / largest) ** exponent) / (frequency * duration)

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     import control
 
 
+# Samples evaluated at once.
+_BLOCK = 256
+
+
 class DFSM(eqx.Module):
     """A derivative function surrogate model.
 
@@ -299,7 +303,8 @@ def _sum(
 @eqx.filter_jit
 def _evaluate(function: Any, inputs: jax.Array) -> jax.Array:
     flat = inputs.reshape(-1, inputs.shape[-1])
-    return jax.vmap(function)(flat).reshape(*inputs.shape[:-1], -1)
+    values = jax.vmap(function)(flat)
+    return values.reshape(*inputs.shape[:-1], values.shape[-1])
 
 
 @eqx.filter_jit

@@ -129,7 +129,9 @@ class Samples:
 def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
     """Keep the channels that the fit reads, check them, and put the runs in their order."""
     roles = choices.roles
-    state_names(choices.states)
+    twice = [n for n in choices.outputs if n in state_names(choices.states)]
+    if twice:
+        raise DfsmError(f"'{twice[0]}' is a state, which models simulate: leave it out of outputs")
     names = dict.fromkeys(roles)
     if choices.azimuth is not None and choices.azimuth.angle is not None:
         names[choices.azimuth.angle] = None

@@ -59,6 +59,10 @@ class SimulationSettings:
     atol: float = 1e-8
     interpolation: Literal["linear", "cubic"] = "linear"
 
+    def __post_init__(self) -> None:
+        if self.step is not None and not self.step > 0:
+            raise DfsmError(f"the simulation step is {self.step} s, expected more than 0")
+
 
 class Status(enum.Enum):
     """How a simulation ended; the value says what it means and what to do."""
@@ -186,8 +190,10 @@ def simulate(
     if initial is None:
         x0 = np.stack([initial_state(model, r, t) for r, t in zip(batch, starts, strict=True)])
     else:
-        shape = (len(batch), len(model.signals.states))
-        x0 = np.broadcast_to(np.asarray(initial, dtype=np.float64), shape)
+        x0, shape = np.asarray(initial, dtype=np.float64), (len(batch), len(model.signals.states))
+        if x0.shape not in (shape, shape[1:]):
+            raise DfsmError(f"initial has shape {x0.shape}, expected {shape[1:]} or {shape}")
+        x0 = np.broadcast_to(x0, shape)
     psi0 = np.array([_initial_azimuth(model, r, t) for r, t in zip(batch, starts, strict=True)])
     begin = clock.perf_counter()
     meshes = [mesh_of(d, options.step, options.interpolation) for d in driven]
@@ -232,6 +238,9 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     before = (run.time <= start) & (run.time >= start - _HISTORY)
     if all(spec.order == 1 or spec.rate for spec in specs):
         index = int(np.argmin(np.abs(run.time - start)))
+        # Two samples make a trajectory, whose check says which channel is not finite and when.
+        near = slice(max(0, index - 1), index + 1) if index else slice(0, 2)
+        replace(run, time=run.time[near], values=run.values[near]).require_finite()
         values = dict(zip(run.names, run.values[index], strict=True))
         rates = [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
         return np.array([values[spec.name] for spec in specs] + rates)
@@ -269,15 +278,16 @@ def _result(
     # The sample where it left is kept where it is finite: it shows which way the model went.
     end = int(rows[0]) if len(rows) else len(x)
     status, reason = Status.COMPLETED, ""
-    if len(rows):
+    # An adaptive solver that gives up leaves the samples beyond without a value.
+    if not rollout.solved and (end == len(x) or not finite[end].all()):
+        status, reason = Status.SOLVER_FAILED, f"no solution beyond {driven.time[end - 1]:g} s"
+    elif len(rows):
         column = int(np.flatnonzero(escaped[end])[0])
         status = Status.LEFT_REGION if finite[end].all() else Status.NOT_FINITE
         reason = (
             f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
             f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
         )
-    elif not rollout.solved:
-        status, reason = Status.SOLVER_FAILED, f"no solution beyond {driven.time[end - 1]:g} s"
     end = max(2, end)
     inputs = model.join(x[:end], *_groups(model, rollout.inputs[:end]))
     channels = (*s.states, *s.outputs)

@@ -69,7 +69,7 @@ class ChannelError:
     rmse, maximum
         In the channel's unit.
     nrmse
-        RMSE divided by the standard deviation of the recorded signal.
+        RMSE divided by the standard deviation of the recorded signal; infinite for a constant.
     """
 
     rmse: float
@@ -191,8 +191,8 @@ class Validation:
         return float(np.mean(known)) / self.wall_time(model)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values: all figures, without the time series and spectra."""
-        return {
+        """JSON values: all figures, without time series and spectra; None where not finite."""
+        values = {
             "format": 1,
             "channels": [{"name": c.name, "unit": c.unit, "role": c.role} for c in self.channels],
             "models": {name: self._model_dict(name) for name in self.models},
@@ -211,6 +211,7 @@ class Validation:
             "warnings": list(self.warnings),
             "provenance": self.record,
         }
+        return _without_infinities(values)
 
     def _model_dict(self, name: str) -> dict[str, Any]:
         return {
@@ -350,7 +351,8 @@ def _error(simulated: Array, recorded: Array) -> ChannelError:
     spread = float(recorded.std())
     return ChannelError(
         rmse=rmse,
-        nrmse=rmse / spread if spread > 0 else float("inf"),
+        # A constant has a spread of rounding errors.
+        nrmse=rmse / spread if spread > 1e-12 * np.abs(recorded).max() else float("inf"),
         maximum=float(np.abs(difference).max()),
     )
 
@@ -439,6 +441,15 @@ def _leaks(model: DFSM, runs: Sequence[Trajectory]) -> list[str]:
         f"{len(seen)} of the {len(runs)} test runs were used in training ({', '.join(seen[:3])}"
         f"{', …' if len(seen) > 3 else ''}): their errors say little about new runs"
     ]
+
+
+def _without_infinities(value: Any) -> Any:
+    """JSON has no word for infinity: a condition number or an NRMSE may be it."""
+    if isinstance(value, Mapping):
+        return {k: _without_infinities(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_infinities(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _run_dict(run: RunComparison) -> dict[str, Any]:

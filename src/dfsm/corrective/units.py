@@ -47,7 +47,7 @@ def gaussian_units(
     return GaussianUnits(
         shift=jnp.asarray(data.shift),
         scale=jnp.asarray(data.scale * width),
-        centres=jnp.asarray(centres / width),
-        weights=jnp.asarray(weights * data.target_scale),
+        centres=jnp.asarray((centres / width).T),
+        weights=jnp.asarray((weights * data.target_scale).T),
         bias=jnp.asarray(bias * data.target_scale),
     )

@@ -115,11 +115,14 @@ def table(
     ]
     content = element(
         "table",
-        element("caption", caption),
         element("thead", element("tr", *top) if top else "", element("tr", *head)),
         element("tbody", *body),
     )
-    return element("div", content, cls="scroll", tabindex="0", role="region", aria_label=caption)
+    # The caption stands outside of what scrolls, or a phone would show half of it.
+    return join(
+        element("p", caption, cls="caption"),
+        element("div", content, cls="scroll", tabindex="0", role="region", aria_label=caption),
+    )
 
 
 def _is_text(value: object) -> bool:

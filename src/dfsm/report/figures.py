@@ -71,7 +71,9 @@ def page_data(validations: Mapping[str, Validation]) -> dict[str, Any]:
 def bands_of(validation: Validation, run: RunComparison) -> tuple[Band, ...]:
     """Frequency bands in which peaks of this run were compared."""
     first = next(iter(validation.models.values()))
-    return tuple(b for b in _bands(first, run.recorded) if b is not LOW)
+    found = _bands(first, run.recorded)
+    # A rotor that stands still or turns backwards has no blade-passing band.
+    return tuple(b for b in found if b is not LOW and b.high > b.low >= 0)
 
 
 def thin(run: Trajectory) -> tuple[float, float, Array]:

@@ -188,7 +188,7 @@ def _controls() -> Markup:
 def _figure(key: str, label: str, endings: bool = False) -> Markup:
     return element(
         "figure",
-        element("figcaption", element("span", cls="context")),
+        element("figcaption", f"{label}: ", element("span", cls="context")),
         element("div", id=key, cls="plot", role="img", aria_label=label),
         element("ul", id="endings", cls="note") if endings else "",
         element("noscript", "The figures need JavaScript; every figure in a table does not."),

@@ -24,7 +24,7 @@
   const curve = (index) => css(`--curve-${(index % 5) + 1}`);
 
   // Curves that coincide stay visible: the earlier ones are drawn wider and below.
-  const width = (index) => Math.max(2.4 - 0.65 * index, 1);
+  const width = (index) => Math.max(2.1 - 0.5 * index, 1);
 
   function node(tag, text, className) {
     const made = document.createElement(tag);
@@ -35,7 +35,8 @@
 
   // -- stacked panels ---------------------------------------------------------------------------
 
-  const GAP = { top: 26, between: 46, shared: 30, bottom: 44 };
+  // In px; the mode bar has the head to itself, panel labels stand in the gaps.
+  const GAP = { head: 50, top: 26, between: 46, shared: 30, bottom: 44 };
 
   // One figure of panels, {label, traces, range, log, bands, x}; a shared x-axis is drawn once.
   function panels(id, list, options) {
@@ -43,7 +44,7 @@
     const rows = Math.ceil(list.length / columns);
     const gap = options.shared ? GAP.shared : GAP.between + GAP.top;
     const inner = rows * options.height + (rows - 1) * gap;
-    const layout = base(inner + GAP.top + GAP.bottom, GAP.top, GAP.bottom);
+    const layout = base(inner + GAP.head + GAP.bottom, GAP.head, GAP.bottom);
     const traces = [];
     list.forEach((panel, k) => {
       const [row, column] = [Math.floor(k / columns), k % columns];
@@ -248,12 +249,14 @@
     r.bands.forEach((b, i) => {
       const patch = node("span", "", "patch");
       patch.style.background = css(`--band-${(i % 3) + 1}`);
-      legend.push(patch, node("span", `${b.name} ${b.low.toPrecision(2)}–${b.high.toPrecision(2)} Hz`));
+      const item = node("span", "", "band");
+      item.append(patch, `${b.name} ${b.low.toPrecision(2)}–${b.high.toPrecision(2)} Hz`);
+      legend.push(item, " ");
     });
     const unfinished = shown().filter(([name]) => !r.variants[name].psd);
     if (unfinished.length) {
       const names = unfinished.map(([name]) => name).join(", ");
-      legend.push(node("span", `. Not drawn, rollout unfinished: ${names}.`));
+      legend.push(node("span", `Not drawn, rollout unfinished: ${names}.`));
     }
     byId("bands").replaceChildren(...legend);
   }
@@ -303,14 +306,13 @@
           "%{x:.4~g} 1/s, %{y:.4~g} rad/s" + (many ? "<br>schedule %{customdata:.4~g}" : ""),
       };
     };
-    const layout = base(340, 12, 46);
+    const layout = base(370, 56, 46);
     layout.margin.l = 58;
     layout.xaxis = axis({ title: { text: "real part (1/s)", standoff: 4 } });
     layout.yaxis = axis({ title: { text: "imaginary part (rad/s)", standoff: 4 } });
     layout.hovermode = "closest";
     layout.showlegend = true;
     layout.legend = { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" };
-    layout.margin.t = 34;
     layout.shapes.push({
       type: "line",
       xref: "x",

@@ -93,7 +93,7 @@ def _ratio(found: ChannelStatistics | None, recorded: ChannelStatistics, band: s
 
 def _incomplete(run: RunComparison, shown: list[str] | None = None) -> Markup:
     missing = [
-        f"{m} ended at {r.simulation.ended:.4g} s ({r.simulation.reason})"
+        f"{m} ended at {r.simulation.ended:.4g} s, {r.simulation.reason}"
         for m, r in run.models.items()
         if r.simulation.status is not Status.COMPLETED and (shown is None or m in shown)
     ]

@@ -13,7 +13,7 @@ from dfsm.trajectory import Channel
 from dfsm.validate import Validation
 
 # More sentences than this about rollouts that ended early are folded away.
-_MOST_NOTES = 6
+_MOST_NOTES = 5
 # Share of the time outside the training range above which a reader is told.
 _OUTSIDE = 0.05
 
@@ -36,7 +36,7 @@ def headline(name: str, validation: Validation) -> Markup:
     span = f"{np.mean(durations):.0f} s" if np.ptp(durations) < 1 else "different lengths"
     tested = f"{plural(count, 'test run')} of {span}"
     if all(n == count for _, n in completed):
-        text = f"Every variant completed {'' if count == 1 else 'all of '}{tested}. "
+        text = f"Every variant completed {'its' if count == 1 else 'all'} {tested}. "
     else:
         each = ", ".join(f"{m} {n} of {count}" for m, n in completed)
         text = f"Completed, of {tested}: {each}. "
@@ -65,7 +65,10 @@ def _listed(items: Sequence[str]) -> str:
 
 def _speed(v: Validation) -> str:
     length = np.mean([r.recorded.duration for r in v.runs])
-    text = f"A rollout of {length:.0f} s takes "
+    unfinished = any(v.completed(m) < len(v.runs) for m in v.models)
+    text = (
+        f"A rollout of {length:.0f} s{' (unfinished ones included)' if unfinished else ''} takes "
+    )
     text += _listed([f"{_two(v.wall_time(m))} s ({m})" for m in v.models])
     known = [r for m in v.models if (r := v.speed_up(m)) is not None]
     if not known:
@@ -242,7 +245,7 @@ def decisions(name: str, validation: Validation) -> Markup:
             r.get("unit", ""),
             r.get("residual_rms"),
             r.get("std"),
-            str(r.get("decision", "")),
+            Cell(str(r.get("decision", "")), "long"),
         ]
         for r in validation.record.get("rows", ())
     ]
@@ -310,11 +313,16 @@ def provenance(name: str, validation: Validation) -> Markup:
     extra = {k: record[k] for k in fitted if k in record}
     settings += [[k, v] for k, v in _flat({"fit": extra})]
     data = [
-        [d["name"], str(d["samples"]), float(d["seconds"]), element("code", d["sha256"][:12])]
+        [
+            d["name"],
+            Markup(int(d["samples"])),
+            float(d["seconds"]),
+            element("code", d["sha256"][:12]),
+        ]
         for d in record.get("data", ())
     ]
     versions = [[k, str(v)] for k, v in record.get("versions", {}).items()]
-    tests = [[r.recorded.name, r.recorded.source or MISSING, f"{len(r.recorded)}",
+    tests = [[r.recorded.name, r.recorded.source or MISSING, Markup(len(r.recorded)),
               r.recorded.wall_time] for r in validation.runs]  # fmt: skip
     parts = [
         ("Settings", ["Setting", "Value"], settings),
