@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -149,7 +150,7 @@ def linear_model(
     *,
     names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
-    order: int = 1,
+    order: Literal[1, 2] = 1,
     corrective: GaussianUnits | None = None,
     span: float = 10.0,
     azimuth: Azimuth | None = None,

@@ -206,17 +206,32 @@ def test_lpv_recovers_coefficients_linear_in_the_schedule(lpv):
 
 
 def test_lpv_windows_each_solve_their_own_least_squares():
-    X, Y, _, _ = scheduled(1, 5000)
+    X, Y, _, _ = scheduled(1, 20_000)
     windows = schedule_windows(X[:, WIND], 4)
     fit = fit_linear([(X, Y)], NAMES, LPV(schedule="wind", points=4), windows)
     s = X[:, WIND]
     for k, (low, high) in enumerate(windows):
         inside = (s >= (low if k else -np.inf)) & (s <= (high if k < 3 else np.inf))
         L, b = reference(X[inside], Y[inside], True)
-        np.testing.assert_allclose(coefficients(fit, k)[0], L, rtol=1e-7, atol=1e-8)
-        np.testing.assert_allclose(coefficients(fit, k)[1], b, rtol=1e-7, atol=1e-7)
+        # They lean on the fit of all windows by one in a hundred samples' worth of what is left.
+        np.testing.assert_allclose(coefficients(fit, k)[0], L, rtol=0, atol=2e-3)
+        np.testing.assert_allclose(coefficients(fit, k)[1], b, rtol=0, atol=2e-2)
         np.testing.assert_allclose(np.asarray(fit.model.grid)[k], s[inside].mean(), rtol=1e-12)
         assert fit.samples[k] == inside.sum()
+
+
+def test_lpv_leans_on_all_windows_where_one_has_no_information():
+    # In the upper half of the wind the pitch is stuck: its effect there is known from below.
+    rng = np.random.default_rng(3)
+    X = rng.normal(size=(20_000, 4))
+    X[:, WIND] = rng.uniform(5, 15, 20_000)
+    X[X[:, WIND] > 10, 1] = 0.5
+    Y = X @ np.array([[1.0], [2.0], [0.3], [-1.0]]) + 0.1 * rng.normal(size=(20_000, 1))
+    windows = schedule_windows(X[:, WIND], 6)
+    fit = fit_linear([(X, Y)], NAMES, LPV(schedule="wind", points=6), windows)
+    for k in range(6):
+        np.testing.assert_allclose(coefficients(fit, k)[0], [[1, 2, 0.3, -1]], atol=0.05)
+    assert fit.warnings == ()
 
 
 def test_lpv_is_continuous_in_the_schedule(lpv):
@@ -268,7 +283,7 @@ def test_no_sample_is_left_out_at_the_ends():
 def test_a_window_with_too_few_samples_is_refused():
     X, Y, _, _ = scheduled(3, 2000)
     X[:, WIND] = np.where(np.arange(2000) < 1000, 5, 15) + 0.1 * X[:, 0]
-    with pytest.raises(DfsmError, match=r"0 samples in the window .* for 5 unknowns .*linear.points"):
+    with pytest.raises(DfsmError, match=r"0 samples in the window .* for 5 unknowns .*points"):
         fit_linear(
             [(X, Y)],
             NAMES,
@@ -284,17 +299,13 @@ def test_a_constant_schedule_and_a_single_window_are_refused():
         schedule_windows(np.arange(100.0), 1)
 
 
-def test_a_warning_says_near_which_schedule_value():
+def test_lpv_names_inputs_confounded_in_all_windows():
     X, Y, _, _ = scheduled(4)
-    high = X[:, WIND] > 11
-    X[high, 3] = 2 * X[high, 1]
+    X[:, 3] = 2 * X[:, 1]
     windows = schedule_windows(X[:, WIND], 5)
     fit = fit_linear([(X, Y)], NAMES, LPV(schedule="wind", points=5), windows)
     (text,) = fit.warnings
-    where = float(text.split("near wind = ")[1].split(":")[0])
-    assert 11.6 < where < 15
-    assert "pitch" in text
-    assert "x3" in text
+    assert "apart: pitch, x3 (" in text or "apart: x3, pitch (" in text
 
 
 def test_a_schedule_of_few_distinct_values_gives_a_finite_model():
@@ -309,4 +320,4 @@ def test_a_schedule_of_few_distinct_values_gives_a_finite_model():
         assert np.isfinite(L).all()
         assert np.isfinite(b).all()
     for value in (6.0, 12.0, 18.0):
-        np.testing.assert_allclose(fit.model.at(value)[0][0, 0], value, atol=1e-6)
+        np.testing.assert_allclose(fit.model.at(value)[0][0, 0], value, atol=1e-4)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from dfsm.corrective import RBF, NoCorrection
+from dfsm.corrective import GP, RBF, NoCorrection
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fit import FitResult, fit
@@ -42,7 +42,7 @@ LINEAR = FitSettings(
     corrective=RBF(samples=40, width=0.5),
     nonlinear_only=False,
 )
-SMALL = RBF(samples=80, width=1.0)
+SMALL = GP(samples=80)
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +123,8 @@ def test_the_corrected_model_is_the_function_itself(duffing, duffing_runs):
     for model in (duffing.model.linear_fit(), duffing.model):
         found = np.asarray(model.derivative(x, v[:, :1], v[:, 1:]))
         errors.append(np.sqrt(np.mean((found - truth)[:, 1] ** 2)) / truth[:, 1].std())
-    assert errors[0] > 0.05
-    assert errors[1] < 0.02
+    assert errors[0] > 0.3
+    assert errors[1] < 0.03
     y = np.asarray(duffing.model.output(x, v[:, :1], v[:, 1:]))[:, 0]
     assert np.sqrt(np.mean((y - fresh["y"]) ** 2)) < 0.05 * fresh["y"].std()
 
@@ -370,7 +370,7 @@ def test_summary_tells_signals_decisions_and_stability(duffing, linear):
     assert "q_dot (m/s): kinematic, its rate is a state" in text
     assert "q_ddot (m/s^2): corrected, residual" in text
     assert "z (m): linear fit, residual" in text
-    assert "Gaussian units" in text
+    assert "(80 points, length scales" in text
     assert "check: 6 of 6 training runs tried simulate to their end" in text
     assert "UNSTABLE" not in text
     assert "eigenvalues (1/s) at A: -0.3 ± 1.98i" in linear.model.summary()
@@ -448,6 +448,7 @@ def test_a_channel_in_two_roles_is_refused(linear_runs):
 
 def test_an_input_may_also_be_an_output(linear_runs):
     model = fit(linear_runs, replace(LINEAR, outputs=("u",))).model
+    assert model.g is not None
     np.testing.assert_allclose(model.g.coefficients[0], [[1, 0, 0, 0]], atol=1e-8)
 
 

@@ -46,25 +46,35 @@ def settings(points: int) -> dfsm.FitSettings:
     )
 
 
+def study() -> dict[str, tuple[dfsm.FitResult, dfsm.Validation]]:
+    """Fit the four models and validate each on its test runs."""
+    found = {}
+    for label, winds in WINDS.items():
+        fitted = dfsm.fit(runs(winds, range(1, 9)), settings(9 if len(winds) > 1 else 5))
+        variants = dfsm.compared(fitted.model, fitted.nonlinear)
+        tests = runs(winds, range(9, 11))
+        found[label] = fitted, dfsm.validate(variants, tests, start=START)
+    return found
+
+
 def main() -> None:
     """Fit and validate the four models, print the table, write the report."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Fit and validate on bundled OpenFAST runs.")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")
     output = parser.parse_args().output
     output.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
-    found = {}
     with dfsm.show_progress(), warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)  # they stand in the report
-        for label, winds in WINDS.items():
-            fitted = dfsm.fit(runs(winds, range(1, 9)), settings(9 if len(winds) > 1 else 5))
-            dfsm.save(fitted.model, output / f"model {label}".replace(" ", "_").replace("/", "p"))
-            variants = dfsm.compared(fitted.model, fitted.nonlinear)
-            found[label] = dfsm.validate(variants, runs(winds, range(9, 11)), start=START)
+        found = study()
+        for label, (fitted, _) in found.items():
+            name = "model_" + label.replace(" m/s", "mps").replace(" ", "_")
+            dfsm.save(fitted.model, output / name, fitted.nonlinear)
+        validations = {label: validation for label, (_, validation) in found.items()}
         report = output / "report.html"
-        dfsm.write_report(found, report, title="IEA 15 MW floating turbine")
-    write_json(output / "metrics.json", {k: v.to_dict() for k, v in found.items()})
-    print_validations(found)
+        dfsm.write_report(validations, report, title="IEA 15 MW floating turbine")
+    write_json(output / "metrics.json", {k: v.to_dict() for k, v in validations.items()})
+    print_validations(validations)
     print(f"\n{time.perf_counter() - begin:.0f} s in all; report: {report.resolve()}")
 
 

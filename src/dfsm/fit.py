@@ -34,6 +34,9 @@ from dfsm.types import Array
 
 # Operating points along the schedule: means of the inputs over equally filled bins.
 _OPERATING_POINTS = 12
+# A correction is kept if it explains at least this share of the residual's variance on runs left
+# out of training.
+_WORTHWHILE = 0.01
 # Training runs that are simulated to check a new model.
 _CHECK_RUNS = 8
 
@@ -101,7 +104,7 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
         e=e.function,
         g=g.model if g else None,
         e_g=e_g.function if e_g else None,
-        region=_region(samples, f.model),
+        region=_region(samples, f.model, data),
         corrected=e.rows,
         corrected_outputs=e_g.rows if e_g else (),
         signals=samples.signals,
@@ -196,7 +199,7 @@ def _correct(
         )
         explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
         # A correction that does no good on runs left out of training would only do harm.
-        kept = [k for k, share in enumerate(trained.explained) if share > 0]
+        kept = [k for k, share in enumerate(trained.explained) if share > _WORTHWHILE]
         function = trained.function.select(kept) if kept else None
         large = [large[k] for k in kept]
     else:
@@ -213,7 +216,10 @@ def _correct(
                 f"{explained[i]:.1%} is explained on left-out runs ({detail})"
             )
         elif i in explained:
-            text = f"linear fit, residual {ratio[i]:.1%}: a correction did not help left-out runs"
+            text = (
+                f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains only "
+                f"{max(explained[i], 0.0):.1%} of its variance on left-out runs"
+            )
         else:
             text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
         decisions.append(
@@ -277,8 +283,11 @@ def _fit_nonlinear(samples: Samples, region: Region, choices: FitSettings) -> DF
 # -- what is handed over ------------------------------------------------------------------------
 
 
-def _region(samples: Samples, model: LinearModel) -> Region:
+def _region(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     inputs = samples.inputs
+    # A signal at a limit differs from file to file by its rounding; that is not "outside".
+    names = [c.name for c in samples.signals.inputs]
+    steps = np.array([(data.channel(n).step or 0.0) if n in data.names else 0.0 for n in names])
     if model.schedule is None:
         grid, operating = inputs.mean(axis=0)[:1], inputs.mean(axis=0)[None]
     else:
@@ -287,8 +296,8 @@ def _region(samples: Samples, model: LinearModel) -> Region:
         operating = np.stack([inputs[rows].mean(axis=0) for rows in bins])
         grid = operating[:, model.schedule]
     return Region(
-        low=jnp.asarray(inputs.min(axis=0)),
-        high=jnp.asarray(inputs.max(axis=0)),
+        low=jnp.asarray(inputs.min(axis=0) - steps),
+        high=jnp.asarray(inputs.max(axis=0) + steps),
         mean=jnp.asarray(inputs.mean(axis=0)),
         std=jnp.asarray(inputs.std(axis=0)),
         grid=jnp.asarray(grid),

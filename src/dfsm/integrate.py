@@ -153,7 +153,7 @@ def _march(
     def one(
         x0: jax.Array, psi0: jax.Array, h: jax.Array, v: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
+        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]), unroll=8)
         xs = jnp.concatenate([x0[None], xs])
         return xs, _observe(model, h, xs, v[::2], psi0)
 

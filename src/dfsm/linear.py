@@ -11,7 +11,7 @@ combination of two fitted ones.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import equinox as eqx
@@ -26,6 +26,8 @@ from dfsm.types import Array, IntArray
 
 # Rows per block of the accumulation: a block of tens of columns stays in the cache.
 _BLOCK = 8192
+# Samples per independent one in a densely sampled time series.
+_CORRELATED = 100.0
 # Two input directions whose standardised spread differs by more than this cannot be told apart
 # by least squares in 64-bit normal equations with a few digits to spare.
 CONDITION_LIMIT = 1e4
@@ -122,7 +124,7 @@ class LinearFit:
     windows
         Schedule range of every window, shape ``(point, 2)``; empty for an LTI model.
     condition
-        Condition number of the standardised inputs, worst window.
+        Condition number of the standardised inputs over all windows.
     warnings
         Sentences that name inputs which the data cannot tell apart.
     """
@@ -187,9 +189,21 @@ class NormalEquations:
         offset = self.sums / self.count
         return np.sqrt(np.maximum(np.diag(self.products) / self.count - offset**2, 0.0))
 
-    def solve(self, affine: bool) -> Solution:
-        """Solve for the coefficients, in the minimum-norm sense of the standardised inputs."""
+    def solve(self, affine: bool, prior: Solution | None = None) -> Solution:
+        """Solve for the coefficients.
+
+        Parameters
+        ----------
+        affine
+            Fit an offset.
+        prior
+            A fit over more data, whose coefficients hold in directions that these samples hardly
+            excite (a torque at its limit, say). None takes the solution of minimum norm in the
+            standardised inputs.
+        """
         mean, products = self.moments(centred=affine)
+        if prior is not None:
+            return self._lean_on(prior, self.solve(affine), mean, products)
         m = self.n_inputs
         scale = np.sqrt(np.maximum(np.diag(products)[:m], 0.0))
         # A column that does not vary gets no coefficient; any scale but zero will do.
@@ -208,8 +222,35 @@ class NormalEquations:
             offset=mean[m:] - L @ mean[:m],
             residual_variance=np.maximum(rss, 0.0),
             target_variance=np.maximum(np.diag(products)[m:], 0.0),
+            input_variance=np.maximum(np.diag(products)[:m], 0.0),
             eigenvalues=np.maximum(eigenvalues, 0.0),
             directions=V,
+        )
+
+    def _lean_on(self, prior: Solution, own: Solution, mean: Array, products: Array) -> Solution:
+        """Ridge towards `prior`, weighted by its input variances.
+
+        The weight is the share of the target that these samples' `own` fit leaves over, so that
+        data without noise are not biased, over the number of independent samples, taken as one
+        in a hundred.
+        """
+        m = self.n_inputs
+        Q, right = products[:m, :m], products[:m, m:]
+        target_variance = np.maximum(np.diag(products)[m:], np.finfo(float).tiny)
+        share = np.minimum(own.residual_variance / target_variance, 1.0)
+        weight = share * min(1.0, _CORRELATED / self.count)
+        pull = np.diag(prior.input_variance)
+        L = np.empty_like(prior.coefficients)
+        for t, w in enumerate(np.maximum(weight, 1e-12)):
+            A, b = Q + w * pull, right[:, t] + w * pull @ prior.coefficients[t]
+            L[t] = np.linalg.lstsq(A, b, rcond=None)[0]
+        rss = np.diag(products)[m:] - np.einsum("ij,ji->j", 2 * right - Q @ L.T, L)
+        return replace(
+            prior,
+            coefficients=L,
+            offset=mean[m:] - L @ mean[:m],
+            residual_variance=np.maximum(rss, 0.0),
+            target_variance=target_variance,
         )
 
 
@@ -221,6 +262,7 @@ class Solution:
     offset: Array
     residual_variance: Array
     target_variance: Array
+    input_variance: Array
     eigenvalues: Array
     directions: Array
 
@@ -323,7 +365,8 @@ def fit_linear(
             sums[k].add(inputs[inside], targets[inside])
             schedule_sums[k] += s[inside].sum()
     _check_counts(sums, windows, choice)
-    solutions = [e.solve(choice.affine) for e in sums]
+    whole = merge(sums).solve(choice.affine)
+    solutions = [e.solve(choice.affine, whole) for e in sums] if lpv else [whole]
     counts = np.array([e.count for e in sums])
     grid = schedule_sums / counts if lpv else np.zeros(1)
     model = LinearModel(
@@ -341,8 +384,8 @@ def fit_linear(
         target_std=merge(sums).std[m:],
         samples=counts,
         windows=windows,
-        condition=max(s.condition for s in solutions),
-        warnings=_warnings(solutions, grid, input_names, choice),
+        condition=whole.condition,
+        warnings=_warnings(whole, input_names),
     )
 
 
@@ -372,19 +415,13 @@ def _check_counts(sums: Sequence[NormalEquations], windows: Array, choice: LTI |
             )
 
 
-def _warnings(
-    solutions: Sequence[Solution], grid: Array, names: Sequence[str], choice: LTI | LPV
-) -> tuple[str, ...]:
-    worst = [(s.condition, g, s) for s, g in zip(solutions, grid, strict=True)]
-    worst = [item for item in worst if item[0] > CONDITION_LIMIT]
-    if not worst:
+def _warnings(solution: Solution, names: Sequence[str]) -> tuple[str, ...]:
+    if solution.condition <= CONDITION_LIMIT:
         return ()
-    condition, point, solution = max(worst, key=lambda item: item[0])
-    where = f" near {choice.schedule} = {point:.4g}" if isinstance(choice, LPV) else ""
     which = ", ".join(solution.confounded(list(names)))
-    figure = f"{condition:.1e}" if np.isfinite(condition) else "infinite"
+    figure = f"{solution.condition:.1e}" if np.isfinite(solution.condition) else "infinite"
     return (
-        f"the runs cannot tell these inputs apart{where}: {which} (condition number {figure}); "
+        f"the runs cannot tell these inputs apart: {which} (condition number {figure}); "
         "predictions hold where the inputs stay related as in the training runs, "
         "the separate coefficients mean little",
     )

@@ -9,8 +9,8 @@ one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `d
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -84,7 +84,7 @@ class DFSM(eqx.Module):
             State derivatives per second, shape ``(..., state)``.
         """
         inputs = self.join(states, controls, disturbances, parameters)
-        return _evaluate(partial(_derivative, self), inputs)
+        return _evaluate(self, _derivative, inputs)
 
     def output(
         self,
@@ -110,15 +110,17 @@ class DFSM(eqx.Module):
             Outputs, shape ``(..., output)``.
         """
         inputs = self.join(states, controls, disturbances, parameters)
+        if self.g is None:
+            return jnp.zeros((*inputs.shape[:-1], 0))
         if self.signals.azimuth is None:
-            return _evaluate(partial(_output, self), inputs)
+            return _evaluate(self, _output, inputs)
         if azimuth is None:
             harmonics = jnp.zeros((*inputs.shape[:-1], 2))
         else:
             harmonics = blade_harmonics(azimuth, self.signals.azimuth.blades)
         shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
         parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
-        return _evaluate(partial(_output, self), jnp.concatenate(parts, axis=-1))
+        return _evaluate(self, _output, jnp.concatenate(parts, axis=-1))
 
     def join(
         self,
@@ -196,10 +198,10 @@ class DFSM(eqx.Module):
             raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
         n_uw = len(self.signals.controls) + len(self.signals.disturbances)
         xs, us = slice(n_uw, n_uw + len(self.signals.states)), slice(0, n_uw)
-        J = np.asarray(_jacobian(partial(_derivative, self), inputs))
+        J = np.asarray(_jacobian(self, _derivative, inputs))
         extra = jnp.zeros(2 if self.signals.azimuth else 0)
         G = (
-            np.asarray(_jacobian(partial(_output, self), jnp.concatenate([inputs, extra])))
+            np.asarray(_jacobian(self, _output, jnp.concatenate([inputs, extra])))
             if self.g is not None
             else np.empty((0, len(inputs)))
         )
@@ -300,13 +302,23 @@ def _sum(
     return value if corrective is None else value.at[np.array(rows)].add(corrective(inputs))
 
 
+Row = Callable[[DFSM, jax.Array], jax.Array]
+
+
 @eqx.filter_jit
-def _evaluate(function: Any, inputs: jax.Array) -> jax.Array:
+def _evaluate(model: DFSM, row: Row, inputs: jax.Array) -> jax.Array:
+    """Evaluate `_derivative` or `_output` at inputs ``(..., input)``."""
     flat = inputs.reshape(-1, inputs.shape[-1])
-    values = jax.vmap(function)(flat)
+
+    def one(inputs: jax.Array) -> jax.Array:
+        return row(model, inputs)
+
+    # Blocks keep the activations of hundreds of units in the cache instead of in memory.
+    many = flat.shape[0] > 2 * _BLOCK
+    values = jax.lax.map(one, flat, batch_size=_BLOCK) if many else jax.vmap(one)(flat)
     return values.reshape(*inputs.shape[:-1], values.shape[-1])
 
 
 @eqx.filter_jit
-def _jacobian(function: Any, inputs: jax.Array) -> jax.Array:
-    return jax.jacfwd(function)(inputs)
+def _jacobian(model: DFSM, row: Row, inputs: jax.Array) -> jax.Array:
+    return jax.jacfwd(lambda inputs: row(model, inputs))(inputs)

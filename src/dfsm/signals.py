@@ -134,7 +134,8 @@ class Region(eqx.Module):
     Attributes
     ----------
     low, high
-        Range of every input over the training runs, shape ``(input,)``.
+        Range of every input over the training runs, widened by one quantisation step, shape
+        ``(input,)``.
     mean, std
         Over all training samples, shape ``(input,)``.
     grid

@@ -137,7 +137,7 @@ class Validation:
     runs
         Test runs in the order given.
     histograms
-        Per channel, over the runs that all models completed.
+        Per channel, over the runs that all models completed which completed any.
     eigenvalues
         Of the linear fit, per schedule point.
     record
@@ -178,9 +178,8 @@ class Validation:
         return sum(r.models[model].simulation.status is Status.COMPLETED for r in self.runs)
 
     def wall_time(self, model: str) -> float:
-        """Mean wall time per completed rollout in s, warm."""
-        done = [r.models[model].simulation for r in self.runs]
-        return float(np.mean([s.wall_time for s in done]))
+        """Mean wall time per rollout in s, compiled; one that ended early costs no less."""
+        return float(np.mean([r.models[model].simulation.wall_time for r in self.runs]))
 
     def speed_up(self, model: str) -> float | None:
         """Recorded wall time of the simulator over that of the model, if the runs carry it."""
@@ -296,7 +295,7 @@ def _compare(
     inside = found.trajectory.window(*window)
     rows = np.isin(found.trajectory.time, inside.time)
     recorded = _recorded(first, run.window(*window), inside)
-    bands = _bands(first, recorded)
+    bands = frequency_bands(first, recorded)
     inputs = inside.select([c.name for c in s.inputs]).values
     results = {}
     for name, model in models.items():
@@ -363,7 +362,7 @@ def _derivative_errors(model: DFSM, predicted: Array, extracted: Array) -> dict[
     return dict(zip(model.signals.names("states"), (rms / spread).tolist(), strict=True))
 
 
-def _bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
+def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
     """Platform and wave bands, and ± 20 % around the mean blade-passing frequency.
 
     Without `Azimuth` settings a state in rpm is taken for the speed of a three-bladed rotor.
@@ -412,7 +411,11 @@ def _statistics(
 
 
 def _histogram(runs: Sequence[RunComparison], channel: str, models: Sequence[str]) -> Histogram:
-    """Errors of all models between common edges that hold 99.5 % of them, over common runs."""
+    """Errors between common edges that hold 99.5 % of them, over runs that all models completed.
+
+    A model that completed no run has no say in which runs those are, and no counts.
+    """
+    models = [m for m in models if any(channel in r.models[m].errors for r in runs)]
     common = [r for r in runs if all(channel in r.models[m].errors for m in models)]
     errors = {
         m: np.concatenate(
@@ -421,7 +424,7 @@ def _histogram(runs: Sequence[RunComparison], channel: str, models: Sequence[str
         )
         for m in models
     }
-    pooled = np.concatenate(list(errors.values()))
+    pooled = np.concatenate([np.empty(0), *errors.values()])
     limit = float(np.percentile(np.abs(pooled), 99.5)) if len(pooled) else 1.0
     edges = np.linspace(-limit, limit, _BINS + 1) if limit > 0 else np.linspace(-1, 1, _BINS + 1)
     counts = {m: np.histogram(np.clip(e, edges[0], edges[-1]), edges)[0] for m, e in errors.items()}

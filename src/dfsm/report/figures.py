@@ -21,7 +21,7 @@ from dfsm.validate import (
     ChannelStatistics,
     RunComparison,
     Validation,
-    _bands,
+    frequency_bands,
 )
 
 # Seconds between the samples drawn: fine enough for blade passing (about 0.5 Hz) and a file of a
@@ -71,7 +71,7 @@ def page_data(validations: Mapping[str, Validation]) -> dict[str, Any]:
 def bands_of(validation: Validation, run: RunComparison) -> tuple[Band, ...]:
     """Frequency bands in which peaks of this run were compared."""
     first = next(iter(validation.models.values()))
-    found = _bands(first, run.recorded)
+    found = frequency_bands(first, run.recorded)
     # A rotor that stands still or turns backwards has no blade-passing band.
     return tuple(b for b in found if b is not LOW and b.high > b.low >= 0)
 

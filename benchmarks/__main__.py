@@ -1,0 +1,41 @@
+"""Run the measurements and print one JSON object.
+
+python -m benchmarks [derivatives] [accuracy] [speed]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import warnings
+
+import dfsm
+from benchmarks import accuracy, derivatives, speed
+from dfsm.files import json_value
+
+PARTS = {"derivatives": derivatives.run, "accuracy": accuracy.run, "speed": speed.run}
+
+
+def main() -> None:
+    """Run the parts named on the command line, or all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}")
+    names = parser.parse_args().parts or list(PARTS)
+    unknown = [n for n in names if n not in PARTS]
+    if unknown:
+        parser.error(f"no part '{unknown[0]}'; choose from {', '.join(PARTS)}")
+    found: dict[str, object] = {
+        "dfsm": dfsm.__version__,
+        "python": platform.python_version(),
+        "processors": os.cpu_count(),
+    }
+    warnings.simplefilter("ignore", dfsm.DfsmWarning)
+    for name in names:
+        found[name] = PARTS[name]()
+    print(json.dumps(json_value(found), indent=2))
+
+
+if __name__ == "__main__":
+    main()
