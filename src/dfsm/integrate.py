@@ -20,6 +20,8 @@ from dfsm.types import Array, IntArray
 # Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 1000
 _MAX_STEPS = 1_000_000
+# Steps per turn of the compiled loop: fewer turns, a little more to compile.
+_UNROLL = 4
 # Below this a second thread costs more than it gains.
 _RUNS_PER_WORKER = 4
 
@@ -78,13 +80,20 @@ def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
     longest = float(np.diff(driven.time).max())
     every = 1 if step is None else max(1, int(np.ceil(longest / step * (1 - 1e-9))))
     parts = np.arange(2 * every) / (2 * every)
-    time = (driven.time[:-1, None] + np.diff(driven.time)[:, None] * parts).ravel()
-    time = np.append(time, driven.time[-1])
+    time = _between(driven.time[:, None], parts)[:, 0]
     if interpolation == "cubic":
         inputs = CubicSpline(driven.time, driven.values)(time)
     else:
-        inputs = driven.resample(time).values
+        inputs = _between(driven.values, parts)
     return Mesh(time, inputs, every)
+
+
+def _between(values: Array, parts: Array) -> Array:
+    """Values at fractions of every interval between rows, and the last row."""
+    steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
+    return np.concatenate(
+        [(values[:-1, None, :] + steps).reshape(-1, values.shape[1]), values[-1:]]
+    )
 
 
 # -- fixed steps --------------------------------------------------------------------------------
@@ -141,6 +150,8 @@ def _march_parts(
 def _march(
     model: DFSM, x0: Array, psi0: Array, h: Array, inputs: Array
 ) -> tuple[jax.Array, jax.Array]:
+    model = model.prepared()
+
     def step(x: jax.Array, drive: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         dt, v0, vm, v1 = drive
         k1 = _slope(model, x, v0)
@@ -150,34 +161,32 @@ def _march(
         x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return x, x
 
-    def one(
-        x0: jax.Array, psi0: jax.Array, h: jax.Array, v: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]), unroll=8)
-        xs = jnp.concatenate([x0[None], xs])
-        return xs, _observe(model, h, xs, v[::2], psi0)
+    def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
+        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]), unroll=_UNROLL)
+        return jnp.concatenate([x0[None], xs])
 
-    return jax.vmap(one)(*map(jnp.asarray, (x0, psi0, h, inputs)))
+    xs = jax.vmap(states)(*map(jnp.asarray, (x0, h, inputs)))
+    return xs, _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
 
 
-def _groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Controls, disturbances and parameters in a vector of exogenous inputs."""
     n_u, n_w = len(model.signals.controls), len(model.signals.disturbances)
     return v[..., :n_u], v[..., n_u : n_u + n_w], v[..., n_u + n_w :]
 
 
 def _slope(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
-    return model.derivative(x, *_groups(model, v))
+    return model.derivative(x, *exogenous_groups(model, v))
 
 
 def _observe(model: DFSM, h: jax.Array, xs: jax.Array, v: jax.Array, psi0: jax.Array) -> jax.Array:
-    """Outputs along a rollout; the azimuth is the integral of the rollout's own speed."""
+    """Outputs along rollouts ``(..., time, n)``; the azimuth is the integral of their own speed."""
     turn, psi = model.signals.azimuth_rate, None
     if turn is not None:
-        omega = turn[1] * xs[:, turn[0]]
-        angle = jnp.cumsum(0.5 * h * (omega[1:] + omega[:-1]))
-        psi = psi0 + jnp.concatenate([jnp.zeros(1), angle])
-    return model.output(xs, *_groups(model, v), psi)
+        omega = turn[1] * xs[..., turn[0]]
+        angle = jnp.cumsum(0.5 * h * (omega[..., 1:] + omega[..., :-1]), axis=-1)
+        psi = psi0[..., None] + jnp.concatenate([jnp.zeros_like(omega[..., :1]), angle], axis=-1)
+    return model.output(xs, *exogenous_groups(model, v), psi)
 
 
 # -- adaptive steps -----------------------------------------------------------------------------
@@ -202,8 +211,18 @@ def adapt(
         Relative, and absolute in standard deviations of each state.
     """
     rows = mesh.samples
+    # Tolerances as arrays: a Python number would be compiled in, and another compile again.
+    rtol, atol = map(jnp.asarray, tolerances)
     states, outputs, solved = _adapt(
-        model, mesh.time, mesh.inputs, jnp.asarray(x0), psi0, method, *tolerances, mesh.every
+        model,
+        mesh.time,
+        mesh.inputs,
+        jnp.asarray(x0),
+        jnp.asarray(psi0),
+        rtol,
+        atol,
+        method=method,
+        every=mesh.every,
     )
     return Rollout(np.asarray(states), np.asarray(outputs), mesh.inputs[rows], bool(solved))
 
@@ -214,10 +233,11 @@ def _adapt(
     time: Array,
     inputs: Array,
     x0: jax.Array,
-    psi0: float,
+    psi0: jax.Array,
+    rtol: jax.Array,
+    atol: jax.Array,
+    *,
     method: str,
-    rtol: float,
-    atol: float,
     every: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     import diffrax
@@ -225,6 +245,7 @@ def _adapt(
     path = diffrax.LinearInterpolation(jnp.asarray(time), jnp.asarray(inputs))
     n_uw = len(model.signals.controls) + len(model.signals.disturbances)
     spread = model.region.std[n_uw : n_uw + len(model.signals.states)]
+    spread = jnp.where(spread > 0, spread, 1.0)
     term = diffrax.ODETerm(lambda t, z, _: _slope(model, z * spread, path.evaluate(t)) / spread)
     samples = jnp.asarray(time[:: 2 * every])
     solution = diffrax.diffeqsolve(
@@ -242,5 +263,5 @@ def _adapt(
     )
     states = jnp.asarray(solution.ys) * spread
     v = jnp.asarray(inputs[:: 2 * every])
-    outputs = _observe(model, jnp.diff(samples), states, v, jnp.asarray(psi0))
+    outputs = _observe(model, jnp.diff(samples), states, v, psi0)
     return states, outputs, solution.result == diffrax.RESULTS.successful

@@ -10,6 +10,7 @@ one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `d
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 # Samples evaluated at once.
-_BLOCK = 256
+_BLOCK = 4096
 
 
 class DFSM(eqx.Module):
@@ -162,21 +163,20 @@ class DFSM(eqx.Module):
         u, w, x, p = (inputs[..., a:b] for a, b in zip([0, *ends[:-1]], ends, strict=True))
         return x, u, w, p
 
+    def prepared(self) -> DFSM:
+        """The same model with what does not depend on the inputs computed once, for use in loops.
+
+        It evaluates like the model itself, but cannot be saved.
+        """
+        e = None if self.e is None else self.e.prepared()
+        e_g = None if self.e_g is None else self.e_g.prepared()
+        return replace(self, e=e, e_g=e_g)  # pyright: ignore[reportArgumentType]
+
     # -- derived models -------------------------------------------------------------------------
 
     def linear_fit(self) -> DFSM:
         """Return the model without its corrective functions: f̂_L and ĝ_L."""
-        return DFSM(
-            f=self.f,
-            e=None,
-            g=self.g,
-            e_g=None,
-            region=self.region,
-            corrected=(),
-            corrected_outputs=(),
-            signals=self.signals,
-            provenance=self.provenance,
-        )
+        return replace(self, e=None, e_g=None, corrected=(), corrected_outputs=())
 
     def jacobians(
         self,
@@ -296,10 +296,15 @@ def _output(model: DFSM, inputs: jax.Array) -> jax.Array:
 
 
 def _sum(
-    linear: LinearModel, corrective: Corrective | None, rows: tuple[int, ...], inputs: jax.Array
+    linear: LinearModel, corrective: Callable | None, rows: tuple[int, ...], inputs: jax.Array
 ) -> jax.Array:
     value = linear(inputs)
-    return value if corrective is None else value.at[np.array(rows)].add(corrective(inputs))
+    if corrective is None:
+        return value
+    # Written out per row: a scatter costs more than all the rest of a small model.
+    place = {row: k for k, row in enumerate(rows)}
+    extra = corrective(inputs)
+    return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(value)])
 
 
 Row = Callable[[DFSM, jax.Array], jax.Array]
@@ -308,6 +313,7 @@ Row = Callable[[DFSM, jax.Array], jax.Array]
 @eqx.filter_jit
 def _evaluate(model: DFSM, row: Row, inputs: jax.Array) -> jax.Array:
     """Evaluate `_derivative` or `_output` at inputs ``(..., input)``."""
+    model = model.prepared()
     flat = inputs.reshape(-1, inputs.shape[-1])
 
     def one(inputs: jax.Array) -> jax.Array:

@@ -12,12 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args, overload
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.integrate import Rollout, adapt, march, mesh_of
+from dfsm.integrate import Rollout, adapt, exogenous_groups, march, mesh_of
 from dfsm.model import DFSM
 from dfsm.settings import settings
 from dfsm.signals import with_corrected_wind
@@ -275,7 +278,6 @@ def _result(
     finite = np.isfinite(x)
     escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > _ESCAPE * half)
     rows = np.flatnonzero(escaped.any(axis=1))
-    # The sample where it left is kept where it is finite: it shows which way the model went.
     end = int(rows[0]) if len(rows) else len(x)
     status, reason = Status.COMPLETED, ""
     # An adaptive solver that gives up leaves the samples beyond without a value.
@@ -288,24 +290,27 @@ def _result(
             f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
             f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
         )
-    end = max(2, end)
-    inputs = model.join(x[:end], *_groups(model, rollout.inputs[:end]))
+        # The sample where it left shows which way the model went.
+        end += status is Status.LEFT_REGION
+    values = np.concatenate([x, rollout.outputs], axis=1)[: max(2, end)]
+    values[end:] = np.nan  # a trajectory has two samples, even if the first step failed
     channels = (*s.states, *s.outputs)
-    values = np.concatenate([x[:end], rollout.outputs[:end]], axis=1)
-    time = driven.time[:end]
+    time = driven.time[: len(values)]
+    outside = np.asarray(_outside(model, x, rollout.inputs))[:end]
     return Simulation(
         trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
         status=status,
-        ended=float(time[-1]),
+        ended=float(time[end - 1]),
         reason=reason,
-        outside=float(np.mean(model.region.outside(inputs))),
+        outside=float(outside.mean()),
         wall_time=wall,
     )
 
 
-def _groups(model: DFSM, exogenous: Array) -> tuple[Array, Array, Array]:
-    n_u, n_w = len(model.signals.controls), len(model.signals.disturbances)
-    return exogenous[:, :n_u], exogenous[:, n_u : n_u + n_w], exogenous[:, n_u + n_w :]
+@eqx.filter_jit
+def _outside(model: DFSM, states: Array, exogenous: Array) -> jax.Array:
+    u, w, p = exogenous_groups(model, jnp.asarray(exogenous))
+    return model.region.outside(model.join(states, u, w, p))
 
 
 def _warn(results: Sequence[Simulation]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -13,8 +14,10 @@ from dfsm.sampling import Method, Subsample
 from dfsm.settings import settings
 from dfsm.types import Array, IntArray
 
-# Widths are tried as multiples of the typical distance between two standardised samples.
-_WIDTHS = (0.35, 0.5, 0.71, 1.0, 1.41, 2.0, 2.83)
+# Widths tried first, as multiples of the typical distance between two standardised samples; then
+# the neighbours of the best.
+_WIDTHS = (0.5, 1.0, 2.0)
+_FINER = np.sqrt(2.0)
 _RIDGES = 10.0 ** np.arange(-9.0, 1.0)
 
 
@@ -72,10 +75,16 @@ class IncrementalRBF:
 def fit_rbf(data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF) -> CorrectiveFit:
     """Train an RBF network: width and ridge by cross-validation, then weights on all targets."""
     base = data.typical_distance
-    widths = _WIDTHS if choice.width is None else (choice.width,)
     search = data.thinned(SEARCH_SAMPLES)
-    trials = [(*_cross_validate(search, points.points, base * w), w) for w in widths]
-    error, ridge, width = min(trials, key=lambda trial: float(trial[0].sum()))
+
+    def best(widths: Iterable[float]) -> tuple[Array, Array, float]:
+        trials = [(*_cross_validate(search, points.points, base * w), w) for w in widths]
+        return min(trials, key=lambda trial: float(trial[0].sum()))
+
+    error, ridge, width = best(_WIDTHS if choice.width is None else (choice.width,))
+    if choice.width is None:
+        finer = best((width * _FINER, width / _FINER))
+        error, ridge, width = min((error, ridge, width), finer, key=lambda t: float(t[0].sum()))
     total = _final_sums(data, points, base * width, choice.targets)
     mean, products = total.moments(centred=True)
     n = len(points.points)
@@ -92,7 +101,7 @@ def fit_rbf(data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF) 
         data, points.points[used], base * width, weights, mean[n:] - mean[used] @ weights
     )
     ridges = ", ".join(f"{r:.0e}" for r in ridge)
-    detail = f"{len(used)} Gaussian units, relative width {width:g}, ridge {ridges}"
+    detail = f"{len(used)} Gaussian units, relative width {width:.2g}, ridge {ridges}"
     return CorrectiveFit(function, 1 - error, detail)
 
 

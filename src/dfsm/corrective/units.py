@@ -17,8 +17,13 @@ _BLOCK = 8192
 def activations(z: Array, centres: Array, width: float | Array) -> Array:
     """Gaussian units exp(-|z - c|² / width²), shape ``(sample, unit)``."""
     a, c = z / width, centres / width
-    squared = (a**2).sum(1)[:, None] + (c**2).sum(1) - 2 * a @ c.T
-    return np.exp(-np.maximum(squared, 0.0))
+    # In place, and with a unit's activations next to each other: this is where training spends
+    # its time.
+    exponents = c @ (2 * a.T)
+    exponents -= (a**2).sum(1)
+    exponents -= (c**2).sum(1)[:, None]
+    np.minimum(exponents, 0.0, out=exponents)
+    return np.exp(exponents, out=exponents).T
 
 
 def unit_sums(z: Array, targets: Array, centres: Array, width: float | Array) -> NormalEquations:
