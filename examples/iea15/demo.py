@@ -21,6 +21,9 @@ from dfsm.read import with_wall_times
 DATA = Path(__file__).parent
 WINDS = {"6 m/s": ["06"], "12 m/s": ["12"], "18 m/s": ["18"], "all winds": ["06", "12", "18"]}
 START = 100.0  # s, the start-up transient before it is dropped
+# 1/s. Least squares leaves the platform mode undamped below rated wind, see docs/method.md. Chosen
+# on rollouts of training seeds 3 and 7; the test seeds had no say.
+MARGIN = 0.04
 
 
 def runs(winds: list[str], seeds: range) -> list[dfsm.Trajectory]:
@@ -40,7 +43,7 @@ def settings(points: int) -> dfsm.FitSettings:
         controls=("GenTq", "BldPitch1"),
         disturbances=("RotWind", "RotShearV", "RotShearH", "Wave1Elev"),
         outputs=("TwrBsFxt", "TwrBsMyt", "GenPwr"),
-        linear=dfsm.LPV(schedule="RotWind", points=points),
+        linear=dfsm.LPV(schedule="RotWind", points=points, margin=MARGIN),
         azimuth=dfsm.Azimuth(speed="GenSpeed", angle="LSSTipPxa"),
         start=START,
     )
@@ -50,7 +53,7 @@ def study() -> dict[str, tuple[dfsm.FitResult, dfsm.Validation]]:
     """Fit the four models and validate each on its test runs."""
     found = {}
     for label, winds in WINDS.items():
-        fitted = dfsm.fit(runs(winds, range(1, 9)), settings(9 if len(winds) > 1 else 5))
+        fitted = dfsm.fit(runs(winds, range(1, 9)), settings(7 if len(winds) > 1 else 5))
         variants = dfsm.compared(fitted.model, fitted.nonlinear)
         tests = runs(winds, range(9, 11))
         found[label] = fitted, dfsm.validate(variants, tests, start=START)

@@ -6,16 +6,19 @@ Exit codes: 0 done · 1 done, but a simulation ended early · 2 bad input · 3 a
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.progress import show_progress
 
 if TYPE_CHECKING:
@@ -58,11 +61,13 @@ def init(
     quiet: Quiet = False,
 ) -> None:
     """Write a commented configuration with the channels found in the files."""
+    from dfsm.files import check_file
     from dfsm.template import write_config
 
+    check_file(output)
     if output.exists() and not force:
         raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
-    with show_progress(not quiet):
+    with _working(quiet):
         write_config(files, output)
     _say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
@@ -80,7 +85,7 @@ def fit(
     from dfsm.storage import check_target, save
 
     check_target(output)
-    with show_progress(not quiet):
+    with _working(quiet):
         settings, runs = load_config(config)
         result = run_fit(runs, settings.fit_settings())
     save(result.model, output, result.nonlinear)
@@ -89,7 +94,7 @@ def fit(
 
         _print_json(json_value(dict(result.model.provenance.record)))
         return
-    _say(result.model.summary(), quiet)
+    _say(_lines(result.model.summary()), quiet)
     seconds = sum(result.seconds.values())
     _say(f"fitted {len(runs)} runs in {seconds:.1f} s, saved in {output}", quiet)
 
@@ -101,7 +106,7 @@ def summary(
     """Describe a saved model: signals, decisions, eigenvalues, warnings."""
     from dfsm.storage import load
 
-    typer.echo(load(model).summary())
+    typer.echo(_lines(load(model).summary()))
 
 
 @app.command()
@@ -126,19 +131,24 @@ def validate(
 ) -> None:
     """Simulate test runs, compare with what was recorded, write a report."""
     from dfsm.console import print_validation
-    from dfsm.files import write_json
+    from dfsm.files import check_file, write_json
     from dfsm.read import read_all, with_wall_times
     from dfsm.report import write_report
     from dfsm.storage import NONLINEAR, load_all
     from dfsm.validate import compared
     from dfsm.validate import validate as run_validate
 
+    targets = [path for path in (output, metrics) if path is not None]
+    for path in targets:
+        check_file(path)
     models = load_all(model)
     main = next(iter(models.values()))
     settings = main.provenance.record.get("settings", {})
     start = settings.get("start") if start is None else start
-    with show_progress(not quiet):
+    with _working(quiet):
         runs = read_all(files)
+        for path in targets:
+            check_file(path, [wall_times, *(r.source for r in runs)])
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
@@ -149,9 +159,8 @@ def validate(
         write_json(metrics, found.to_dict())
     if not quiet:
         print_validation(found)
-    for path in (output, metrics):
-        if path is not None:
-            _say(f"wrote {path}", quiet)
+    for path in targets:
+        _say(f"wrote {path}", quiet)
     _exit_if_ended([r.models[m].simulation for r in found.runs for m in ("multi-fidelity",)], quiet)
 
 
@@ -170,17 +179,21 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Simulate the model with the inputs of one run and write states and outputs."""
+    from dfsm.files import check_file
     from dfsm.read import read, write_table
+    from dfsm.read.tables import table_suffix
     from dfsm.simulate import METHODS, SimulationSettings
     from dfsm.simulate import simulate as run_simulate
     from dfsm.storage import load
 
     if method not in METHODS:
         raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    table_suffix(output)
+    check_file(output, [run] if Path(run).exists() else [])
     surrogate = load(model)
     settings = surrogate.provenance.record.get("settings", {})
     start = settings.get("start") if start is None else start
-    with show_progress(not quiet), warnings.catch_warnings():
+    with _working(quiet), warnings.catch_warnings():
         warnings.simplefilter("ignore", DfsmWarning)  # the outcome is printed below
         result = run_simulate(
             surrogate,
@@ -209,43 +222,79 @@ def simulate(
 def main() -> None:
     """Run the command line; the only place that turns errors into exit codes."""
     warnings.showwarning = _show_warning
+    warnings.simplefilter("always", DfsmWarning)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A terminal that lacks a letter shows an escape instead of failing.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    code = _run()
     try:
-        code = app(standalone_mode=False)
+        sys.stdout.flush()
+    except OSError as error:
+        # The reader of our output has gone (… | head), or the disk it goes to is full. Without
+        # this, the interpreter would try again on its way out and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            code = _fail(f"error: standard output could not be written ({error.strerror})", 2)
+    sys.exit(code)
+
+
+def _run() -> int:
+    try:
+        code = app(prog_name="dfsm", standalone_mode=False)
+        if code == 130:  # the command-line library has caught Ctrl-C already
+            raise KeyboardInterrupt
+        return code if isinstance(code, int) else 0
     except DfsmError as error:
-        code = _fail(f"error: {error}", 2)
+        return _fail(f"error: {error}", 2)
     except KeyboardInterrupt:
-        code = _fail("interrupted: nothing was left half-written", 130)
+        return _fail("interrupted: nothing was left half-written", 130)
     except BrokenPipeError:
-        # The reader of our output has gone (… | head); there is nobody left to tell.
-        sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
-        code = 0
+        return 0
+    except SystemExit as stop:
+        # Libraries turn a pipe that nobody reads any more into exit code 1; nothing went wrong.
+        return 0 if isinstance(stop.__context__, BrokenPipeError) else 3
+    except OSError as error:
+        where = error.filename or "standard output"
+        return _fail(f"error: {where} cannot be used ({error.strerror or error})", 2)
     except Exception as error:
-        code = _unexpected(error)
-    sys.exit(code if isinstance(code, int) else 0)
+        return _unexpected(error)
 
 
 def _unexpected(error: Exception) -> int:
     """Usage errors of the command-line library, and bugs."""
+    kind = type(error).__name__
+    if kind == "NoArgsIsHelpError":
+        print(str(error), file=sys.stderr)
+        return 2
     if hasattr(error, "format_message"):
         context = getattr(error, "ctx", None)
-        usage = f"{context.get_usage()}\n" if context is not None else ""
-        return _fail(f"{usage}error: {error.format_message()}", 2)  # pyright: ignore[reportAttributeAccessIssue]
-    if type(error).__name__ == "Abort":
+        command = context.command_path if context is not None else "dfsm"
+        text = str(error.format_message()).rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
+        return _fail(f"error: {text[:1].lower()}{text[1:]}; see {command} --help", 2)
+    if kind == "Abort":
         return _fail("interrupted: nothing was left half-written", 130)
-    if type(error).__name__ == "Exit":
-        return int(getattr(error, "exit_code", 0))
     if os.environ.get("DFSM_DEBUG"):
         raise error
-    return _fail(
-        f"bug in dfsm: {type(error).__name__}: {error}\n"
-        "please report it with the traceback that DFSM_DEBUG=1 shows",
-        3,
-    )
+    print(f"bug in dfsm: {kind}: {error}", file=sys.stderr)
+    return _fail("please report it with the traceback that DFSM_DEBUG=1 shows", 3)
 
 
 def _fail(message: str, code: int) -> int:
-    print(message, file=sys.stderr)
+    print(printable(message), file=sys.stderr)
     return code
+
+
+@contextmanager
+def _working(quiet: bool) -> Iterator[None]:
+    """Long work: bars on a terminal; with --quiet neither these nor warnings."""
+    with show_progress(not quiet), warnings.catch_warnings():
+        if quiet:
+            warnings.simplefilter("ignore", DfsmWarning)
+        yield
+
+
+def _lines(text: str) -> str:
+    return "\n".join(printable(line) for line in text.split("\n"))
 
 
 def _say(message: str, quiet: bool) -> None:
@@ -254,7 +303,8 @@ def _say(message: str, quiet: bool) -> None:
 
 
 def _print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False))
+    # ASCII, so that it is JSON in every terminal's encoding.
+    typer.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
 def _exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:
@@ -269,7 +319,7 @@ def _exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
     if issubclass(category, DfsmWarning):
-        print(f"warning: {message}", file=sys.stderr)
+        print(printable(f"warning: {message}"), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
-from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.errors import DfsmError, near_matches
 from dfsm.linear import LPV, LTI
 from dfsm.read import read_all
@@ -100,6 +100,13 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
     """
     path = Path(path)
     config = parse_config(path)
+    if not config.data.train:
+        raise DfsmError(f"{path}: 'data.train' names no files: list the runs to train with")
+    try:
+        # What only shows with all keys together must not wait until the data have been read.
+        _ = state_names(config.signals.states), config.fit_settings().roles
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
     return config, read_all(config.data.train, path.parent)
 
 
@@ -116,6 +123,8 @@ def parse_config(path: Path) -> Config:
         raise DfsmError(f"{path}, line {line}: not valid YAML ({error.problem})") from None
     except (YAMLError, UnicodeDecodeError) as error:
         raise DfsmError(f"{path} is not valid YAML ({str(error).splitlines()[0]})") from None
+    except RecursionError:
+        raise DfsmError(f"{path} is nested too deeply for a configuration") from None
     if not isinstance(raw, dict):
         raise DfsmError(f"{path} holds no keys; make a configuration with dfsm init")
     try:
@@ -135,15 +144,28 @@ def _explain(error: ValidationError, raw: dict[str, Any]) -> str:
     keys = _path(first["loc"], raw)
     where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _known_keys(keys[:-1])
+        known = _known_keys(keys[:-1], raw)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
     if first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument"):
         return f"key '{where}' is missing"
     if first["type"].startswith("union_tag"):
-        kinds = first.get("ctx", {}).get("expected_tags", "")
+        kinds = ", ".join(f"'{kind}'" for kind in _kinds(keys))
         return f"'{where}' needs a key 'kind', one of {kinds}"
     found = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
-    return f"'{where}': {first['msg'][0].lower()}{first['msg'][1:]}{found}"
+    message = _MESSAGES.get(first["type"], first["msg"])
+    return f"'{where}': {message[0].lower()}{message[1:]}{found}"
+
+
+# Where pydantic speaks of Python, in the words of a configuration file.
+_KEYS, _LIST = "keys and values were expected, as {key: value}", "a list was expected, as [a, b]"
+_MESSAGES: dict[str, str] = {
+    "model_type": _KEYS,
+    "model_attributes_type": _KEYS,
+    "dataclass_type": _KEYS,
+    "dict_type": _KEYS,
+    "list_type": _LIST,
+    "tuple_type": _LIST,
+}
 
 
 def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
@@ -161,14 +183,30 @@ def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
     return keys
 
 
-def _known_keys(keys: list[int | str]) -> list[str]:
+def _known_keys(keys: list[int | str], raw: Any) -> list[str]:
     """Keys that may stand at a path, from the JSON schema of the configuration."""
+    nodes = _schemas(keys)
+    for key in keys:
+        raw = raw[key]
+    kinds = [n for n in nodes if _kind(n) == raw.get("kind")]
+    return list(dict.fromkeys(k for node in kinds or nodes for k in node.get("properties", {})))
+
+
+def _kinds(keys: list[int | str]) -> list[str]:
+    """Values that the key 'kind' may have at a path."""
+    return [kind for node in _schemas(keys) if (kind := _kind(node))]
+
+
+def _kind(node: dict[str, Any]) -> str | None:
+    return node.get("properties", {}).get("kind", {}).get("const")
+
+
+def _schemas(keys: list[int | str]) -> list[dict[str, Any]]:
     schema = Config.model_json_schema()
     nodes = [schema]
     for key in keys:
         nodes = [child for node in nodes for child in _children(schema, node, key)]
-    found = dict.fromkeys(k for node in nodes for k in node.get("properties", {}))
-    return list(found)
+    return nodes
 
 
 def _children(schema: dict[str, Any], node: dict[str, Any], key: int | str) -> list[dict[str, Any]]:

@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from dfsm.errors import printable
+
 if TYPE_CHECKING:
     from dfsm.read.info import RunInfo
     from dfsm.validate import Validation
@@ -24,15 +26,15 @@ def print_info(runs: Sequence[RunInfo]) -> None:
             else f"irregular, {run.min_interval:g} to {run.max_interval:g} s"
         )
         span = f"{run.samples} samples, {run.start:g} to {run.stop:g} s, {sampling}"
-        console.print(Text(f"{run.source or run.name}: {span}"))
+        console.print(_text(f"{run.source or run.name}: {span}"))
         table = _table("channel", "unit", "min", "max", "mean", "std", "step")
         for c in run.channels:
             step = "–" if c.step is None else f"{c.step:.3g}"
             figures = [f"{v:.5g}" for v in (c.min, c.max, c.mean, c.std)]
-            table.add_row(Text(c.name), Text(c.unit), *figures, step)
+            table.add_row(_text(c.name), _text(c.unit), *figures, step)
         console.print(table)
         for text in run.warnings:
-            console.print(Text(f"warning: {text}"))
+            console.print(_text(f"warning: {text}"))
 
 
 def print_validation(found: Validation) -> None:
@@ -54,8 +56,8 @@ def print_validations(found: Mapping[str, Validation]) -> None:
     table = _table(*(["model"] if several else []), "channel", "unit", *variants, "RMSE*", "max*")
     for label, validation in found.items():
         for i, c in enumerate(validation.channels):
-            row: list[str | Text] = [Text(label if i == 0 else "")] if several else []
-            row += [Text(c.name), Text(c.unit)]
+            row: list[str | Text] = [_text(label if i == 0 else "")] if several else []
+            row += [_text(c.name), _text(c.unit)]
             row += [_figure(validation.mean_nrmse(v, c.name), ".3f") for v in variants]
             row += [
                 _figure(validation.mean_error("multi-fidelity", c.name, what), ".4g")
@@ -73,7 +75,7 @@ def print_validations(found: Mapping[str, Validation]) -> None:
     for label, validation in found.items():
         for i, variant in enumerate(validation.models):
             speed = validation.speed_up(variant)
-            row = [Text(label if i == 0 else "")] if several else []
+            row = [_text(label if i == 0 else "")] if several else []
             row += [
                 variant,
                 f"{validation.completed(variant)} of {len(validation.runs)}",
@@ -85,7 +87,11 @@ def print_validations(found: Mapping[str, Validation]) -> None:
     for label, validation in found.items():
         prefix = f"{label}: " if several else ""
         for text in (*validation.warnings, *validation.endings()):
-            console.print(Text(f"{prefix}{text}"))
+            console.print(_text(f"{prefix}{text}"))
+
+
+def _text(text: str) -> Text:
+    return Text(printable(text))
 
 
 def _figure(value: float | None, form: str) -> str:

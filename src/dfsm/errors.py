@@ -17,6 +17,11 @@ class DfsmWarning(UserWarning):
     """Something a user should know about a result that was produced nevertheless."""
 
 
+def printable(text: str) -> str:
+    """Show what a terminal would act on or break a line at as an escape: names are data."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def near_matches(name: str, known: Iterable[str]) -> str:
     """Suggest known names that resemble `name`, as the tail of an error sentence.
 

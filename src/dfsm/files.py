@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,8 +27,9 @@ def write_file(path: str | Path) -> Iterator[Path]:
         The folder does not exist, cannot be written, or the disk is full.
     """
     path = Path(path)
-    if path.is_dir():
-        raise DfsmError(f"{path} is a folder, a file name was expected: give one, or remove it")
+    _check_ordinary(path)
+    # The file that a link points to is replaced, not the link.
+    path = path.resolve() if path.is_symlink() else path
     with _sentences(path):
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         os.close(handle)
@@ -67,6 +68,28 @@ def write_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> Iterat
             shutil.rmtree(temporary, ignore_errors=True)
 
 
+def check_file(path: str | Path, sources: Iterable[str | Path | None] = ()) -> None:
+    """Fail where `write_file` would fail: call it before long work, not after.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    sources
+        Files that the work reads, which must not be lost to its result.
+
+    Raises
+    ------
+    DfsmError
+        `path` is a folder or one of `sources`, or its parent is no folder or read-only.
+    """
+    path = Path(path)
+    _check_ordinary(path)
+    _check_parent(path)
+    if path.exists() and any(s is not None and path.samefile(s) for s in sources):
+        raise DfsmError(f"{path} is one of the files to read: choose another name to write to")
+
+
 def check_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> None:
     """Fail where `write_folder` would refuse: call it before long work, not after.
 
@@ -80,9 +103,29 @@ def check_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> None:
         raise DfsmError(
             f"{path} exists and is not a folder that dfsm wrote: choose another name or remove it"
         )
+    if path.exists() and (path.samefile(Path.cwd()) or path.is_mount()):
+        raise DfsmError(
+            f"{path} is the working folder or a mount point, which cannot be replaced in one step: "
+            "give the name of a folder in it"
+        )
+    _check_parent(path)
+
+
+def _check_ordinary(path: Path) -> None:
+    if path.is_dir():
+        raise DfsmError(f"{path} is a folder, a file name was expected: give one, or remove it")
+    if path.exists() and not path.is_file():
+        raise DfsmError(f"{path} is a device or a pipe, a file name was expected: give one")
+
+
+def _check_parent(path: Path) -> None:
     if not path.parent.is_dir():
         raise DfsmError(
-            f"{path} cannot be written: there is no folder {path.parent}, make it first"
+            f"{path} could not be written: there is no folder {path.parent}, make it first"
+        )
+    if not os.access(path.parent, os.W_OK):
+        raise DfsmError(
+            f"{path} could not be written: the folder {path.parent} is read-only, choose another"
         )
 
 
@@ -92,7 +135,7 @@ def _exchange(new: Path, path: Path) -> None:
         new.rename(path)
         return
     aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-    old = aside / path.name
+    old = aside / "replaced"
     try:
         path.rename(old)
         new.rename(path)
@@ -125,7 +168,8 @@ def write_json(path: str | Path, value: object) -> None:
     """Write JSON atomically; numbers that are not finite become null, which JSON can hold."""
     with write_file(path) as temporary:
         text = json.dumps(json_value(value), indent=2, allow_nan=False, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        # What UTF-8 cannot hold (bytes of a foreign file name) becomes an escape that JSON knows.
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def json_value(value: object) -> object:

@@ -29,13 +29,15 @@ from dfsm.read.wind import wind_warning
 from dfsm.samples import FitSettings, Samples, extract, select
 from dfsm.signals import Provenance, Region
 from dfsm.simulate import Status, simulate
+from dfsm.stability import stabilise
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.types import Array
 
 # Operating points along the schedule: means of the inputs over equally filled bins.
 _OPERATING_POINTS = 12
 # A correction is kept if it explains at least this share of the residual's variance on runs left
-# out of training.
+# out of training. Less than that is within what cross-validation finds in noise, and may undo what
+# a stable linear fit has gained.
 _WORTHWHILE = 0.01
 # Training runs that are simulated to check a new model.
 _CHECK_RUNS = 8
@@ -112,6 +114,7 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
     with _timed(seconds, "checks"):
         notes, checks = _check(model, samples, data, choices)
     notes = [*f.warnings, *(g.warnings if g else ()), *notes]
+    checks = [*f.notes, *checks]
     nonlinear = None
     if choices.nonlinear_only and not isinstance(choices.corrective, NoCorrection):
         with _timed(seconds, "nonlinear-only"):
@@ -135,6 +138,14 @@ def _fit_derivatives(samples: Samples, choices: FitSettings) -> LinearFit:
     fitted = [i for i in range(samples.derivatives.shape[1]) if i not in known]
     result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], choices)
     n_uw = len(choices.controls) + len(choices.disturbances)
+    if choices.linear.margin is not None:
+        columns = slice(n_uw, n_uw + samples.derivatives.shape[1])
+        before = result.residual_rms
+        result, moved = stabilise(
+            result, columns, known, choices.linear.margin, choices.linear.affine
+        )
+        names = [samples.derivative_names[i][0] for i in fitted]
+        result = replace(result, notes=_account(choices, moved, names, before, result.residual_rms))
     points, _, n_inputs = result.model.coefficients.shape
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])
@@ -145,6 +156,26 @@ def _fit_derivatives(samples: Samples, choices: FitSettings) -> LinearFit:
         L[:, row, n_uw + rate] = 1.0
     model = LinearModel(result.model.grid, jnp.asarray(L), jnp.asarray(b), result.model.schedule)
     return replace(result, model=model, residual_rms=rms, target_std=std)
+
+
+def _account(
+    choices: FitSettings, moved: list[float], names: list[str], before: Array, after: Array
+) -> tuple[str, ...]:
+    """What making the fit stable cost."""
+    if not moved:
+        return ("all eigenvalues were left of the margin, none was moved",)
+    growth = ", ".join(
+        f"{name} {max(a / b - 1, 0.0):+.2%}"
+        for name, a, b in zip(names, after, before, strict=True)
+    )
+    where = ""
+    if isinstance(choices.linear, LPV):
+        points = ", ".join(f"{p:.4g}" for p in moved)
+        where = f" at {choices.linear.schedule} = {points}"
+    return (
+        f"eigenvalues were moved left of -{choices.linear.margin:g} 1/s{where}; residuals of the "
+        f"linear fit change by {growth}",
+    )
 
 
 def _fit_outputs(samples: Samples, choices: FitSettings) -> LinearFit | None:
@@ -323,8 +354,8 @@ def _check(
         where = f"{model.schedule} = {points}" if model.schedule else "its only point"
         notes.append(
             f"the linear fit is unstable at {where} (fastest growth "
-            f"{max(v for _, v in unstable):.3g} 1/s): right for an unstable system, otherwise "
-            "expect rollouts to drift off"
+            f"{max(v for _, v in unstable):.3g} 1/s): right for an unstable system; for any "
+            "other set linear.margin, or expect rollouts to drift off"
         )
     some = [data[i] for i in np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int))]
     with warnings.catch_warnings():

@@ -41,10 +41,14 @@ class LTI:
     ----------
     affine
         Fit an offset (centred regression). False is the paper's ``L = Ẋ Iᵀ (I Iᵀ)⁻¹``.
+    margin
+        If set, eigenvalues of A with a real part above ``-margin`` (1/s) are moved there, see
+        `stabilise`. Never for a system that is truly unstable.
     """
 
     kind: Literal["LTI"] = "LTI"
     affine: bool = True
+    margin: float | None = None
 
 
 @settings
@@ -59,12 +63,15 @@ class LPV:
         Number of windows, at least 2.
     affine
         Fit an offset in every window.
+    margin
+        As for `LTI`, at every schedule point.
     """
 
     kind: Literal["LPV"] = "LPV"
     schedule: str
     points: int = 5
     affine: bool = True
+    margin: float | None = None
 
 
 class LinearModel(eqx.Module):
@@ -127,8 +134,12 @@ class LinearFit:
         Schedule range of every window, shape ``(point, 2)``; empty for an LTI model.
     condition
         Condition number of the standardised inputs over all windows.
+    equations
+        The sums behind every schedule point.
     warnings
         Sentences that name inputs which the data cannot tell apart.
+    notes
+        What was done to the fit afterwards, and what it cost.
     """
 
     model: LinearModel
@@ -137,7 +148,9 @@ class LinearFit:
     samples: IntArray
     windows: Array
     condition: float
+    equations: tuple[NormalEquations, ...]
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 class NormalEquations:
@@ -254,6 +267,54 @@ class NormalEquations:
             residual_variance=np.maximum(rss, 0.0),
             target_variance=target_variance,
         )
+
+    def partial_covariance(self, columns: slice, affine: bool) -> Array:
+        """Covariance of some inputs that the other inputs do not explain."""
+        _, products = self.moments(centred=affine)
+        m = self.n_inputs
+        free = np.ones(m, dtype=bool)
+        free[columns] = False
+        Q = products[:m, :m]
+        scale = np.sqrt(np.maximum(np.diag(Q), np.finfo(float).tiny))
+        R = Q / np.outer(scale, scale)
+        others = np.linalg.lstsq(R[np.ix_(free, free)], R[free, columns], rcond=1e-9)[0]
+        partial = R[columns, columns] - R[columns, free] @ others
+        # A state that the others explain altogether may change freely, but not without bound.
+        partial = partial + 1e-9 * np.eye(len(partial))
+        return partial * np.outer(scale[columns], scale[columns])
+
+    def complete(self, columns: slice, fixed: Array, affine: bool) -> tuple[Array, Array, Array]:
+        """Best remaining coefficients when those of some inputs are given.
+
+        Parameters
+        ----------
+        columns
+            The inputs whose coefficients are given.
+        fixed
+            Those coefficients, shape ``(target, len(columns))``.
+        affine
+            Fit an offset.
+
+        Returns
+        -------
+        tuple of ndarray
+            All coefficients ``(target, input)``, offsets and residual variances ``(target,)``.
+        """
+        mean, products = self.moments(centred=affine)
+        m = self.n_inputs
+        Q, right = products[:m, :m], products[:m, m:]
+        free = np.ones(m, dtype=bool)
+        free[columns] = False
+        scale = np.sqrt(np.maximum(np.diag(Q)[free], np.finfo(float).tiny))
+        rest = (right - Q[:, columns] @ fixed.T)[free] / scale[:, None]
+        L = np.empty((len(fixed), m))
+        L[:, columns] = fixed
+        solved = np.linalg.lstsq(Q[np.ix_(free, free)] / np.outer(scale, scale), rest, rcond=1e-9)[
+            0
+        ]
+        L[:, free] = (solved / scale[:, None]).T
+        rss = np.diag(products)[m:] - np.einsum("ij,ji->j", 2 * right - Q @ L.T, L)
+        return L, mean[m:] - L @ mean[:m], np.maximum(rss, 0.0)
 
 
 @dataclass(frozen=True)
@@ -387,6 +448,7 @@ def fit_linear(
         samples=counts,
         windows=windows,
         condition=whole.condition,
+        equations=tuple(sums),
         warnings=_warnings(whole, input_names),
     )
 

@@ -13,7 +13,7 @@ from dfsm.derivatives import DerivativeSettings, StateSpec, differentiate, state
 from dfsm.errors import DfsmError
 from dfsm.linear import LPV, LTI
 from dfsm.progress import track
-from dfsm.settings import settings
+from dfsm.settings import require, settings
 from dfsm.signals import (
     Azimuth,
     SignalTable,
@@ -68,15 +68,25 @@ class FitSettings:
     derivatives: DerivativeSettings = field(default_factory=DerivativeSettings)
     linear: LTI | LPV = field(default_factory=LTI)
     corrective: CorrectiveChoice = field(default_factory=RBF)
-    gate: float = 0.02
+    gate: float = 0.01
     azimuth: Azimuth | None = None
     hub_height: float | None = None
     nonlinear_only: bool = True
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        require(self.gate >= 0, "gate", self.gate, "0 or more")
+        require(self.seed >= 0, "seed", self.seed, "0 or more")
+
     @property
     def roles(self) -> dict[str, Role]:
-        """Role of every channel that the fit reads."""
+        """Role of every channel that the fit reads.
+
+        Raises
+        ------
+        DfsmError
+            A channel is listed twice, or in two roles that exclude each other.
+        """
         roles: dict[str, Role] = {}
         groups: tuple[tuple[Role, Iterable[str]], ...] = (
             ("state", [n for s in self.states for n in (s.name, s.rate, s.acceleration) if n]),
@@ -86,7 +96,9 @@ class FitSettings:
             ("output", self.outputs),
         )
         for role, names in groups:
-            for name in names:
+            for i, name in enumerate(names := list(names)):
+                if role != "state" and name in names[:i]:
+                    raise DfsmError(f"channel '{name}' is listed twice as {role}: name it once")
                 if roles.get(name, role) != role and "output" not in (role, roles[name]):
                     raise DfsmError(
                         f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
@@ -142,7 +154,7 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
     data = Dataset(picked)
     for name in names:
         data.channel(name)
-    for name in (*choices.controls, *choices.disturbances):
+    for name in (*choices.controls, *choices.disturbances, *choices.parameters):
         windows = [r.window(choices.start, choices.stop)[name] for r in data]
         low, high = min(w.min() for w in windows), max(w.max() for w in windows)
         if low == high:
@@ -151,7 +163,20 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
                 f"can be learned about its effect: leave it out of {roles[name]}s, or add runs "
                 "in which it varies"
             )
+    _check_parameters(data, choices)
     return data
+
+
+def _check_parameters(data: Dataset, choices: FitSettings) -> None:
+    for run in data:
+        for name in choices.parameters:
+            values = run.window(choices.start, choices.stop)[name]
+            if np.ptp(values) > 1e-9 * np.abs(values).max():
+                raise DfsmError(
+                    f"{run.where}: parameter '{name}' varies from {values.min():g} to "
+                    f"{values.max():g}, but parameters are constant within a run: list it as a "
+                    "disturbance"
+                )
 
 
 def extract(data: Dataset, choices: FitSettings) -> Samples:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeVar, dataclass_transform
 
+from dfsm.errors import DfsmError
+
 T = TypeVar("T")
 
 
@@ -18,3 +20,9 @@ def settings(cls: type[T]) -> type[T]:
     new = dataclass(frozen=True, kw_only=True)(cls)
     new.__pydantic_config__ = {"extra": "forbid"}  # pyright: ignore[reportAttributeAccessIssue]
     return new
+
+
+def require(holds: bool, name: str, value: object, expected: str) -> None:
+    """Refuse the value of a setting unless `holds`, in one sentence."""
+    if not holds:
+        raise DfsmError(f"{name} is {value}, expected {expected}")

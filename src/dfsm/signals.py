@@ -16,7 +16,7 @@ import dfsm.precision  # noqa: F401
 from dfsm.derivatives import DerivativeSettings, StateSpec
 from dfsm.errors import DfsmError, near_matches
 from dfsm.read.wind import CORRECTED_WIND, undisturbed_rotor_wind
-from dfsm.settings import settings
+from dfsm.settings import require, settings
 from dfsm.trajectory import Channel, Trajectory
 
 # Radians per second in one unit of a rotor or generator speed.
@@ -45,6 +45,9 @@ class Azimuth:
     speed: str
     angle: str | None = None
     blades: int = 3
+
+    def __post_init__(self) -> None:
+        require(self.blades >= 1, "azimuth.blades", self.blades, "at least 1")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from safetensors.numpy import load_file, save_file
 import dfsm
 from dfsm.corrective import Corrective, GaussianUnits, Perceptron
 from dfsm.errors import DfsmError
-from dfsm.files import check_folder, write_folder, write_json
+from dfsm.files import check_folder, json_value, write_folder, write_json
 from dfsm.linear import LinearModel
 from dfsm.model import DFSM
 from dfsm.signals import Provenance, Region, SignalTable
@@ -63,7 +63,7 @@ def save(model: DFSM, path: str | Path, nonlinear: DFSM | None = None) -> None:
             "models": structure,
             "provenance": dict(model.provenance.record),
         }
-        write_json(folder / MANIFEST, manifest)
+        write_json(folder / MANIFEST, {**manifest, "checksum": _checksum(manifest)})
 
 
 def check_target(path: str | Path) -> None:
@@ -100,7 +100,7 @@ def load_all(path: str | Path) -> dict[str, DFSM]:
             name: _put_together(structure, name, tensors, signals, provenance)
             for name, structure in manifest["models"].items()
         }
-    except (KeyError, TypeError, ValidationError) as error:
+    except (KeyError, TypeError, AttributeError, ValidationError) as error:
         raise _damaged(path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]) from None
 
 
@@ -193,7 +193,14 @@ def _put_together(
 
 
 def _is_model(path: Path) -> bool:
-    return {p.name for p in path.iterdir()} <= {MANIFEST, TENSORS}
+    # Both files: other programs write a manifest.json too.
+    return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
+
+
+def _checksum(manifest: Mapping[str, Any]) -> str:
+    """Digest of all that a manifest says, however its JSON is laid out."""
+    said = {k: v for k, v in manifest.items() if k != "checksum"}
+    return hashlib.sha256(json.dumps(json_value(said), sort_keys=True).encode()).hexdigest()
 
 
 def _damaged(path: Path, what: str) -> DfsmError:
@@ -208,7 +215,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DfsmError(f"{path} holds no {MANIFEST}, so it is not a model folder") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise _damaged(path, f"{MANIFEST} cannot be read ({error})") from None
     version = manifest.get("format") if isinstance(manifest, dict) else None
     if not isinstance(version, int):
@@ -218,6 +225,8 @@ def _read_manifest(path: Path) -> dict[str, Any]:
             f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to {FORMAT}: "
             "upgrade with pip install -U dfsm"
         )
+    if manifest.get("checksum") != _checksum(manifest):
+        raise _damaged(path, f"{MANIFEST} is not as it was written")
     return manifest
 
 

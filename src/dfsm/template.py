@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-from dfsm.files import write_file
+from dfsm.errors import printable
+from dfsm.files import check_file, write_file
 from dfsm.read import describe, read_all
 from dfsm.read.info import ChannelInfo
 from dfsm.trajectory import Trajectory
@@ -58,7 +59,7 @@ corrective:
   sampling: kmeans    # kmeans, maxmin or random
   targets: all        # or cluster_means, as in the paper
 
-gate: 0.02            # correct a row only if its residual exceeds this share of the signal
+gate: 0.01            # correct a row only if its residual exceeds this share of the signal
 azimuth: {azimuth}
 nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in the report
 seed: 0
@@ -81,6 +82,7 @@ def write_config(files: Sequence[str], path: Path) -> None:
         A file cannot be read, or `path` not written.
     """
     runs = read_all(files)
+    check_file(path, [r.source for r in runs])
     text = fill(runs, _relative([r.source or r.name for r in runs], path.parent), path.name)
     with write_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -102,7 +104,7 @@ def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
     long = min(r.time[-1] for r in runs) > 2 * _TRANSIENT + runs[0].time[0]
     relative = wind == "RtVAvgxh"
     return _TEXT.format(
-        name=name,
+        name=printable(name),
         train=_block(train),
         start=_TRANSIENT if long else "null",
         hub_height="null",
@@ -113,7 +115,9 @@ def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
         wind_note=_WIND_NOTE if relative else "",
         disturbances=_flow(disturbances),
         outputs=_flow([o for o in _OUTPUTS if o in varying]),
-        linear=_LPV.format(schedule=_flow(wind)) if wind else "  kind: LTI",
+        linear=(
+            _LPV.format(schedule=_flow(wind), margin=_MARGIN) if wind else "  kind: LTI\n" + _MARGIN
+        ),
         azimuth=_azimuth(states, varying),
     )
 
@@ -126,7 +130,12 @@ _WIND_NOTE = """
 _LPV = """\
   kind: LPV           # LPV: coefficients vary with the schedule; LTI: they do not
   schedule: {schedule}
-  points: 5"""
+  points: 5
+{margin}"""
+
+_MARGIN = """\
+  margin: null        # 1/s; a number keeps all eigenvalues left of -margin, at the least cost in
+                      # fit quality (not for a system that is truly unstable)"""
 
 
 def _azimuth(states: Sequence[str], varying: dict[str, ChannelInfo]) -> str:
@@ -141,8 +150,7 @@ def _azimuth(states: Sequence[str], varying: dict[str, ChannelInfo]) -> str:
 
 def _comment(channel: ChannelInfo) -> str:
     # A line break in a name must not end the comment.
-    name = channel.name.encode("unicode_escape").decode("ascii")
-    unit = channel.unit.encode("unicode_escape").decode("ascii")
+    name, unit = printable(channel.name), printable(channel.unit)
     return f"#   {name:<16} {unit:<10} {channel.min:.5g} to {channel.max:.5g}"
 
 

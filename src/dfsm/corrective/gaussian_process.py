@@ -12,7 +12,7 @@ import numpy as np
 from dfsm.corrective.training import CorrectiveFit, TrainingSet, cross_validated
 from dfsm.corrective.units import activations, gaussian_units, mean_diagonal, unit_sums
 from dfsm.sampling import Method, Subsample
-from dfsm.settings import settings
+from dfsm.settings import require, settings
 from dfsm.types import Array
 
 
@@ -36,6 +36,9 @@ class GP:
     samples: int = 200
     sampling: Method = "kmeans"
     targets: Literal["all", "cluster_means"] = "all"
+
+    def __post_init__(self) -> None:
+        require(self.samples >= 1, "corrective.samples", self.samples, "at least 1")
 
 
 def fit_gp(data: TrainingSet, points: Subsample, choice: GP, seed: int) -> CorrectiveFit:

@@ -13,7 +13,7 @@ from scipy.optimize import OptimizeResult, minimize
 
 from dfsm.corrective.functions import Perceptron
 from dfsm.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
-from dfsm.settings import settings
+from dfsm.settings import require, settings
 from dfsm.types import Array
 
 Layers = tuple[tuple[jax.Array, jax.Array], ...]
@@ -41,6 +41,12 @@ class MLP:
     hidden: tuple[int, ...] = (24, 24)
     iterations: int = 300
     weight_decay: float = 1e-4
+
+    def __post_init__(self) -> None:
+        wide = all(n >= 1 for n in self.hidden)
+        require(wide, "corrective.hidden", list(self.hidden), "at least 1 unit per layer")
+        require(self.iterations >= 1, "corrective.iterations", self.iterations, "at least 1")
+        require(self.weight_decay >= 0, "corrective.weight_decay", self.weight_decay, "0 or more")
 
 
 def fit_mlp(data: TrainingSet, choice: MLP, seed: int) -> CorrectiveFit:

@@ -11,7 +11,7 @@ from dfsm.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
 from dfsm.corrective.units import gaussian_units, unit_sums
 from dfsm.linear import NormalEquations, merge
 from dfsm.sampling import Method, Subsample
-from dfsm.settings import settings
+from dfsm.settings import require, settings
 from dfsm.types import Array, IntArray
 
 # Widths tried first, as multiples of the typical distance between two standardised samples; then
@@ -45,6 +45,9 @@ class RBF:
     targets: Literal["all", "cluster_means"] = "all"
     width: float | None = None
 
+    def __post_init__(self) -> None:
+        _check_units(self.samples, self.width)
+
 
 @settings
 class IncrementalRBF:
@@ -70,6 +73,17 @@ class IncrementalRBF:
     sampling: Method = "kmeans"
     targets: Literal["all", "cluster_means"] = "all"
     width: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_units(self.samples, self.width)
+        require(self.neurons >= 1, "corrective.neurons", self.neurons, "at least 1")
+        require(self.goal >= 0, "corrective.goal", self.goal, "0 or more")
+
+
+def _check_units(samples: int, width: float | None) -> None:
+    require(samples >= 1, "corrective.samples", samples, "at least 1")
+    positive = width is None or 0 < width < np.inf
+    require(positive, "corrective.width", width, "a positive number")
 
 
 def fit_rbf(data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF) -> CorrectiveFit:

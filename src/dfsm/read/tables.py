@@ -85,10 +85,7 @@ def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = Fals
         Another suffix, `packed` with CSV, names that the kind cannot hold, or a failed write.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".csv", ".parquet") or (packed and suffix == ".csv"):
-        kinds = ".parquet (the only kind that can be packed)" if packed else ".parquet or .csv"
-        raise DfsmError(f"{path}: a table is written to {kinds}: choose a name that ends so")
+    suffix = table_suffix(path, packed=packed)
     for name in trajectory.names:
         if name.lower() == "time":
             raise DfsmError(
@@ -101,6 +98,21 @@ def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = Fals
         from dfsm.read.parquet import write_parquet
 
         write_parquet(trajectory, path, packed=packed)
+
+
+def table_suffix(path: Path, *, packed: bool = False) -> str:
+    """Suffix that decides the kind of table to write.
+
+    Raises
+    ------
+    DfsmError
+        It is none that `write_table` knows.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet") or (packed and suffix == ".csv"):
+        kinds = ".parquet (the only kind that can be packed)" if packed else ".parquet or .csv"
+        raise DfsmError(f"{path}: a table is written to {kinds}: choose a name that ends so")
+    return suffix
 
 
 def split_header(text: str) -> tuple[str, str]:

@@ -53,7 +53,8 @@ def write_report(
         raise DfsmError("no validations were given, a report needs at least one")
     text = _page(validations, title)
     with write_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # File names may hold bytes that are no text.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def _page(validations: Mapping[str, Validation], title: str) -> str:

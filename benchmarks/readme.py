@@ -1,0 +1,91 @@
+"""Write the tables of the README from measurements.
+
+python -m benchmarks > figures.json && python -m benchmarks.readme figures.json
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def accuracy_table(figures: Mapping[str, Any], variant: str = "multi-fidelity") -> list[str]:
+    """Mean NRMSE per model and channel; a dash where a rollout ended early."""
+    models = {label: found[variant] for label, found in figures.items()}
+    channels = list(next(iter(models.values()))["nrmse"])
+    lines = [
+        "| model | rollouts completed | " + " | ".join(channels) + " |",
+        "|---|---|" + "---|" * len(channels),
+    ]
+    for label, found in models.items():
+        cells = ["–" if v is None else f"{v:.2f}" for v in found["nrmse"].values()]
+        done = f"{found['completed']} of {found['of']}"
+        lines.append(f"| {label} | {done} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def speed_table(figures: Mapping[str, Any]) -> list[str]:
+    """One line per timing."""
+    linear, corrective = figures["linear_fit"], figures["corrective"]
+    simulate, start = figures["simulate"], figures["start"]
+    rows = [
+        (
+            "linear fit, 1 000 000 samples × 6 inputs → 4 derivatives",
+            f"{linear['dfsm_s']:.3f} s, {linear['times_faster']:.1f} × faster than "
+            f"`numpy.linalg.lstsq` (coefficients agree to {linear['difference']:.0e})",
+        ),
+        (
+            "subsample and train both corrective functions, 8 runs × 600 s, 200 units each",
+            f"{corrective['both_functions_s']:.1f} s (the paper: 65 s)",
+        ),
+        (
+            "simulate 600 s at 0.05 s, LPV + 200 units for f̂ and for ĝ, outputs included",
+            f"{simulate['one_run_s']:.3f} s, {simulate['times_faster_than_solve_ivp']:.0f} × "
+            "faster than `scipy.integrate.solve_ivp` on the same right-hand side, "
+            f"{simulate['times_faster_than_openfast']:,.0f} × faster than OpenFAST",
+        ),
+        ("100 such runs at once", f"{simulate['hundred_runs_s']:.1f} s"),
+        ("`import dfsm`; `dfsm --help`", f"{start['import_s']:.2f} s; {start['help_s']:.2f} s"),
+    ]
+    return ["| what | time |", "|---|---|", *(f"| {what} | {value} |" for what, value in rows)]
+
+
+def derivatives_table(figures: Mapping[str, Any]) -> list[str]:
+    """Mean and worst error per method, in per cent."""
+    names = {
+        "dfsm_default": "default (quantisation step known)",
+        "dfsm_cross_validation": "default, step unknown",
+        "scipy_quintic": "`UnivariateSpline(k=5, s=N q²/12)`",
+        "paper_cubic": "cubic spline (the paper)",
+    }
+    lines = ["| method | rate, mean / worst | acceleration, mean / worst |", "|---|---|---|"]
+    for key, name in names.items():
+        mean, worst = figures["mean"][key], figures["worst"][key]
+        cells = [f"{mean[w]:.3g} % / {worst[w]:.3g} %" for w in ("rate", "acceleration")]
+        lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
+    return lines
+
+
+TABLES = {"accuracy": accuracy_table, "speed": speed_table, "derivatives": derivatives_table}
+
+
+def main() -> None:
+    """Replace what stands between ``<!-- name -->`` and ``<!-- end -->``."""
+    figures = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    text = README.read_text(encoding="utf-8")
+    for name, table in TABLES.items():
+        if name in figures:
+            head, rest = text.split(f"<!-- {name} -->", 1)
+            tail = rest.split("<!-- end -->", 1)[1]
+            lines = "\n".join(table(figures[name]))
+            text = f"{head}<!-- {name} -->\n{lines}\n<!-- end -->{tail}"
+    README.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

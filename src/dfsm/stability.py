@@ -1,0 +1,139 @@
+"""Linear fits whose eigenvalues stay left of a margin, with an account of what that cost.
+
+Least squares on derivatives underestimates damping wherever a force is missing from the inputs: for
+a stationary signal E[ẍ ẋ] = 0, so what no input explains must not look damped. A slightly unstable
+fit of a well-damped system is the usual result, and its rollouts drift off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import eig
+
+from dfsm.errors import DfsmError
+from dfsm.linear import LinearFit
+from dfsm.types import Array, ComplexArray
+
+_STEPS = 200
+
+
+def state_matrix(coefficients: Array, columns: slice, known: Mapping[int, int]) -> Array:
+    """A from the coefficients of the fitted rows and the kinematic rows.
+
+    Parameters
+    ----------
+    coefficients
+        Fitted rows of L, shape ``(fitted, input)``.
+    columns
+        Input columns that are states.
+    known
+        Kinematic rows, see `kinematic_rows`.
+    """
+    n = columns.stop - columns.start
+    A = np.zeros((n, n))
+    for row, rate in known.items():
+        A[row, rate] = 1.0
+    A[[i for i in range(n) if i not in known]] = coefficients[:, columns]
+    return A
+
+
+def stabilise(
+    fit: LinearFit, columns: slice, known: Mapping[int, int], margin: float, affine: bool
+) -> tuple[LinearFit, list[float]]:
+    """Move eigenvalues right of ``-margin`` onto it, and refit everything else.
+
+    The fitted rows of A change in the way that costs the least fit quality; kinematic rows stay.
+    Coefficients of all inputs that are not states are then fitted again with A held.
+
+    Parameters
+    ----------
+    fit
+        Fit of the rows that are not kinematic.
+    columns
+        Input columns that are states.
+    known
+        Kinematic rows.
+    margin
+        Largest real part allowed is ``-margin``, in 1/s.
+    affine
+        Whether the fit has an offset.
+
+    Returns
+    -------
+    tuple
+        The stable fit, and the schedule points at which eigenvalues were moved.
+
+    Raises
+    ------
+    DfsmError
+        A margin that is not positive, or a mode that cannot be moved.
+    """
+    if not margin > 0:
+        raise DfsmError(f"linear.margin is {margin:g}, expected a positive number of 1/s, or null")
+    rows = [i for i in range(columns.stop - columns.start) if i not in known]
+    coefficients = np.array(fit.model.coefficients)
+    offsets = np.array(fit.model.offsets)
+    variance = np.zeros((len(offsets), offsets.shape[1]))
+    moved = []
+    for k, equations in enumerate(fit.equations):
+        A = state_matrix(coefficients[k], columns, known)
+        fixed = coefficients[k][:, columns]
+        variance[k] = equations.complete(columns, fixed, affine)[2]
+        if np.linalg.eigvals(A).real.max() <= -margin:
+            continue
+        moved.append(float(fit.model.grid[k]))
+        metric = equations.partial_covariance(columns, affine)
+        fixed = fixed + _change(A, rows, metric, variance[k], margin)
+        coefficients[k], offsets[k], variance[k] = equations.complete(columns, fixed, affine)
+    share = fit.samples / fit.samples.sum()
+    model = replace(fit.model, coefficients=jnp.asarray(coefficients), offsets=jnp.asarray(offsets))
+    return replace(fit, model=model, residual_rms=np.sqrt(share @ variance)), moved
+
+
+def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: float) -> Array:
+    """Cheapest change of the fitted rows of A that moves all eigenvalues left of ``-margin``.
+
+    The cost of a change D is what it adds to the residuals, each relative to its variance:
+    ``Σ_r D_r S D_rᵀ / σ_r²``, S being the partial covariance of the states given the other inputs.
+    Each step solves for the cheapest D that moves the eigenvalues there to first order,
+    dλ = wᴴ dA v with the left and right eigenvectors w and v.
+    """
+    total = np.zeros((len(rows), len(A)))
+    inverse = np.linalg.inv(metric)
+    for _ in range(_STEPS):
+        current = A.copy()
+        current[rows] += total
+        eigenvalues, left, right = _eigen(current)
+        # One of each conjugate pair; aiming a little further makes the last step land inside.
+        active = (eigenvalues.real > -margin) & (eigenvalues.imag >= 0)
+        if not active.any():
+            return total
+        wanted = -(eigenvalues.real[active] + margin) - 1e-3 * margin
+        M = [
+            np.real(w[rows].conj()[:, None] * v)
+            for w, v in zip(left[active], right[active], strict=True)
+        ]
+        cheap = [variance[:, None] * m @ inverse for m in M]
+        gram = np.array([[np.sum(a * b) for b in cheap] for a in M])
+        weights = np.linalg.lstsq(gram, wanted, rcond=None)[0]
+        step = sum(w * c for w, c in zip(weights, cheap, strict=True))
+        # Eigenvalues are nonlinear in A: no step may be a large part of the matrix.
+        size, most = np.linalg.norm(step), 0.2 * np.linalg.norm(A[rows])
+        total = total + (step if size <= most else step * most / size)
+    raise DfsmError(
+        "no stable linear fit was found near the least-squares one: leave linear.margin out, or "
+        "look at the eigenvalues and choose other states"
+    )
+
+
+def _eigen(A: Array) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Eigenvalues, left and right eigenvectors as rows, scaled so that wᴴ v = 1."""
+    found: Any = eig(A, left=True, right=True)
+    eigenvalues, left, right = found[0], found[1].T, found[2].T
+    scale = np.sum(left.conj() * right, axis=1)
+    return eigenvalues, left / scale.conj()[:, None], right

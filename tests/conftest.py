@@ -1,0 +1,143 @@
+"""Runs of a small known system on disk, and one model folder fitted to them by the command line."""
+
+from __future__ import annotations
+
+import copy
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from dfsm import cli
+from dfsm.read import write_table
+from dfsm.trajectory import Trajectory
+from outb import write_outb
+from systems import DUFFING
+
+CONFIG: dict[str, Any] = {
+    "data": {"train": ["train/a.csv", "train/b.parquet", "train/c.outb"], "start": 1.0},
+    "signals": {
+        "states": [{"name": "q", "order": 2}],
+        "controls": ["u"],
+        "disturbances": ["w"],
+        "outputs": ["y", "z"],
+    },
+    "corrective": {"kind": "rbf", "samples": 25},
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run of the command line left: exit code, standard output and error."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def sentence(self) -> str:
+        """The one sentence on standard error that bad input earns, and nothing else anywhere."""
+        assert self.code == 2, self
+        assert self.out == "", self.out
+        assert self.err.startswith("error: "), self.err
+        assert self.err.endswith("\n"), self.err
+        assert self.err.count("\n") == 1, self.err
+        assert "Traceback" not in self.err
+        return self.err.removeprefix("error: ").rstrip("\n")
+
+
+Dfsm = Callable[..., Result]
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`train/` and `test/` with one run per kind of file, and `config.yaml`."""
+    base = tmp_path_factory.mktemp("runs")
+    for part in ("train", "test"):
+        (base / part).mkdir()
+    time = np.arange(0, 15.01, 0.05)
+    a, b, c, d = DUFFING.many(4, [(0.3, 1.0), (0.0, 1.0)], time, seed=3)
+    write_table(a, base / "train" / "a.csv")
+    write_table(b, base / "train" / "b.parquet")
+    for run, path in ((c, "train/c.outb"), (d, "test/d.outb")):
+        units = [channel.unit for channel in run.channels]
+        write_outb(base / path, run.time, run.values, run.names, units)
+    write_config(base / "config.yaml", CONFIG)
+    return base
+
+
+@pytest.fixture(scope="session")
+def fitted(folder: Path) -> Path:
+    """Model folder of `folder/config.yaml`; read only."""
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        patch.setattr(sys, "argv", ["dfsm", "fit", f"{folder}/config.yaml", "-o", f"{folder}/m"])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    assert stop.value.code == 0
+    return folder / "m"
+
+
+@pytest.fixture
+def dfsm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Dfsm:
+    """Run the command line in this process."""
+
+    def run(*arguments: object) -> Result:
+        monkeypatch.setattr(sys, "argv", ["dfsm", *map(str, arguments)])
+        capsys.readouterr()
+        with warnings.catch_warnings(), pytest.raises(SystemExit) as stop:
+            cli.main()
+        captured = capsys.readouterr()
+        assert isinstance(stop.value.code, int)
+        return Result(stop.value.code, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture
+def here(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Fresh working folder with links `train` and `test` to the runs."""
+    for part in ("train", "test"):
+        (tmp_path / part).symlink_to(folder / part)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    assert not [p for p in tmp_path.rglob(".*")], "a temporary file was left behind"
+
+
+def write_config(path: Path, content: object) -> Path:
+    """Write a configuration."""
+    with path.open("w", encoding="utf-8") as stream:
+        YAML().dump(content, stream)
+    return path
+
+
+def changed(*path: object, value: object) -> dict[str, Any]:
+    """`CONFIG` with the value at one path replaced."""
+    config = copy.deepcopy(CONFIG)
+    node: Any = config
+    for key in path[:-1]:
+        node = node.setdefault(key, {}) if isinstance(node, dict) else node[key]
+    node[path[-1]] = value
+    return config
+
+
+def files_of(path: Path) -> dict[str, bytes]:
+    """Content of every file below a folder, links not followed."""
+    return {
+        str(p.relative_to(path)): p.read_bytes()
+        for p in sorted(path.rglob("*"))
+        if p.is_file() and not p.is_symlink()
+    }
+
+
+def renamed(run: Trajectory, names: dict[str, str]) -> Trajectory:
+    """Give channels other names."""
+    from dataclasses import replace
+
+    channels = tuple(replace(c, name=names.get(c.name, c.name)) for c in run.channels)
+    return replace(run, channels=channels)

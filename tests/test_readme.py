@@ -1,0 +1,37 @@
+"""The Python example of the README runs as it stands."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dfsm.cli import app
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT / "examples" / "iea15"
+
+
+@pytest.mark.filterwarnings("ignore::dfsm.errors.DfsmWarning")
+def test_python_example(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = (ROOT / "README.md").read_text(encoding="utf-8").split("```python")[1].split("```")[0]
+    assert len([line for line in code.splitlines() if line.strip()]) < 12
+    for folder, speed in (("runs", "06"), ("runs", "12"), ("test", "18")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        name = f"iea15_2dof_{speed}mps_s09.outb"
+        shutil.copy(DATA / name, tmp_path / folder / name)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    assert "linear fit: LPV in RotWind" in capsys.readouterr().out
+    assert "my turbine" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_shell_commands_exist() -> None:
+    names = {c.name or c.callback.__name__ for c in app.registered_commands if c.callback}
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    used = {line.split()[1] for line in text.splitlines() if line.startswith("    dfsm ")}
+    assert used
+    assert used <= names

@@ -1,0 +1,118 @@
+"""Linear fits with eigenvalues left of a margin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from dfsm.errors import DfsmError
+from dfsm.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
+from dfsm.stability import stabilise, state_matrix
+from dfsm.types import Array
+
+# Inputs [u, w, x1, x2, v1, v2]; x' = v is known, v' is fitted.
+NAMES = ["u", "w", "x1", "x2", "v1", "v2"]
+COLUMNS, KNOWN = slice(2, 6), {0: 2, 1: 3}
+
+
+def samples(seed: int = 0, growth: float = 0.02) -> tuple[Array, Array]:
+    """Noisy accelerations of two coupled oscillators, the first of which grows."""
+    rng = np.random.default_rng(seed)
+    inputs = rng.normal(size=(4000, 6)) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
+    inputs[:, 1] += 8.0
+    A = np.array([[-1.0, 0.1, 2 * growth, 0.0], [0.2, -4.0, 0.1, -0.5]])
+    targets = inputs[:, 2:] @ A.T + inputs[:, :2] @ rng.normal(size=(2, 2)) + [1.0, -2.0]
+    return inputs, targets + 0.5 * rng.normal(size=targets.shape)
+
+
+def eigenvalues(fit: LinearFit) -> list[Array]:
+    found = []
+    for L in np.asarray(fit.model.coefficients):
+        found.append(np.linalg.eigvals(state_matrix(L, COLUMNS, KNOWN)).real)
+    return found
+
+
+def residuals(fit: LinearFit, inputs: Array, targets: Array) -> Array:
+    L, b = np.asarray(fit.model.coefficients[0]), np.asarray(fit.model.offsets[0])
+    return np.sqrt(np.mean((targets - inputs @ L.T - b) ** 2, axis=0))
+
+
+@pytest.mark.parametrize("margin", [0.001, 0.05, 0.3])
+def test_eigenvalues_end_left_of_the_margin(margin: float) -> None:
+    inputs, targets = samples()
+    plain = fit_linear([(inputs, targets)], NAMES, LTI())
+    assert max(eigenvalues(plain)[0]) > 0
+    stable, moved = stabilise(plain, COLUMNS, KNOWN, margin, affine=True)
+    assert max(eigenvalues(stable)[0]) <= -margin
+    assert moved == [0.0]
+    # What the account says is what the samples say.
+    assert stable.residual_rms == pytest.approx(residuals(stable, inputs, targets), rel=1e-9)
+    assert np.all(stable.residual_rms >= plain.residual_rms * (1 - 1e-12))
+
+
+def test_the_change_is_the_cheapest_one() -> None:
+    inputs, targets = samples()
+    margin = 0.05
+    plain = fit_linear([(inputs, targets)], NAMES, LTI())
+    stable, _ = stabilise(plain, COLUMNS, KNOWN, margin, affine=True)
+    variance = plain.residual_rms**2
+
+    def cost(fixed: Array) -> float:
+        return float(
+            np.sum(plain.equations[0].complete(COLUMNS, fixed.reshape(2, 4), True)[2] / variance)
+        )
+
+    def room(fixed: Array) -> float:
+        L = np.zeros((2, 6))
+        L[:, COLUMNS] = fixed.reshape(2, 4)
+        return float(-margin - np.linalg.eigvals(state_matrix(L, COLUMNS, KNOWN)).real.max())
+
+    start = np.asarray(stable.model.coefficients[0])[:, COLUMNS].ravel()
+    constraint: Any = {"type": "ineq", "fun": room}
+    best = minimize(cost, start, method="SLSQP", constraints=constraint)
+    least = cost(np.asarray(plain.model.coefficients[0])[:, COLUMNS].ravel())
+    assert cost(start) > least
+    # An independent constrained optimiser, started there, finds nothing much cheaper.
+    assert cost(start) - least <= 1.05 * (best.fun - least)
+
+
+def test_a_stable_fit_is_left_alone() -> None:
+    inputs, targets = samples(growth=-0.3)
+    plain = fit_linear([(inputs, targets)], NAMES, LTI())
+    stable, moved = stabilise(plain, COLUMNS, KNOWN, 0.01, affine=True)
+    assert moved == []
+    np.testing.assert_array_equal(stable.model.coefficients, plain.model.coefficients)
+    np.testing.assert_array_equal(stable.model.offsets, plain.model.offsets)
+
+
+def test_every_schedule_point_is_made_stable() -> None:
+    inputs, targets = samples()
+    choice = LPV(schedule="w", points=4)
+    windows = schedule_windows(inputs[:, 1], 4)
+    plain = fit_linear([(inputs, targets)], NAMES, choice, windows)
+    stable, moved = stabilise(plain, COLUMNS, KNOWN, 0.05, affine=True)
+    unstable = [m > -0.05 for m in map(max, eigenvalues(plain))]
+    assert moved == [float(g) for g, u in zip(plain.model.grid, unstable, strict=True) if u]
+    assert len(moved) > 0
+    assert all(max(e) <= -0.05 for e in eigenvalues(stable))
+
+
+@pytest.mark.parametrize("margin", [0.0, -1.0])
+def test_a_margin_must_be_positive(margin: float) -> None:
+    inputs, targets = samples()
+    plain = fit_linear([(inputs, targets)], NAMES, LTI())
+    with pytest.raises(DfsmError, match=r"linear\.margin is .* expected a positive number"):
+        stabilise(plain, COLUMNS, KNOWN, margin, affine=True)
+
+
+def test_a_mode_out_of_reach_is_an_error() -> None:
+    # x1' = x1 is declared kinematic with itself: no fitted row can change that eigenvalue.
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(500, 2))
+    targets = -inputs[:, 1:] + 0.1 * rng.normal(size=(500, 1))
+    plain = fit_linear([(inputs, targets)], ["a", "b"], LTI())
+    with pytest.raises(DfsmError, match="no stable linear fit was found"):
+        stabilise(plain, slice(0, 2), {0: 0}, 0.1, affine=True)
