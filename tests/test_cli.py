@@ -48,7 +48,9 @@ def test_info_lists_every_run_and_channel(here, dfsm):
     assert not CONSOLE.search(shown.out)
     lines = shown.out.splitlines()
     heads = [line for line in lines if line.startswith("train/")]
-    assert heads == [f"train/{n}: 301 samples, 0 to 15 s, every 0.05 s" for n in ("a.csv", "c.outb")]
+    assert heads == [
+        f"train/{n}: 301 samples, 0 to 15 s, every 0.05 s" for n in ("a.csv", "c.outb")
+    ]
     q = read("train/c.outb").channel("q")
     row = [line.split() for line in lines if line.split()[0] == "q"][1]
     assert row[1] == "m"
@@ -103,7 +105,13 @@ def turbine(path, *names):
 
 
 def test_init_writes_a_config_that_reads_back_and_fits(here, dfsm):
-    names = ["PtfmPitch [deg]", "GenSpeed [rpm]", "GenTq [kN-m]", "BldPitch1 [deg]", "RotWind [m/s]"]
+    names = [
+        "PtfmPitch [deg]",
+        "GenSpeed [rpm]",
+        "GenTq [kN-m]",
+        "BldPitch1 [deg]",
+        "RotWind [m/s]",
+    ]
     for i in range(3):
         turbine(Path(f"r{i}.csv"), *names, f"Extra{i} [m]", "Same [m]")
     shown = dfsm("init", "r*.csv")
@@ -431,7 +439,11 @@ def test_a_reader_that_has_gone_is_no_error(here):
 def test_standard_output_on_a_full_disk(here):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [SCRIPT, "info", "train/a.csv"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            [SCRIPT, "info", "train/a.csv"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
         )
     assert done.returncode == 2
     assert re.fullmatch(r"error: standard output .*No space left on device.*\n", done.stderr)

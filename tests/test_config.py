@@ -6,10 +6,10 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from conftest import CONFIG, changed, write_config
 from hypothesis import given
 from hypothesis import strategies as st
 
+from conftest import CONFIG, changed, write_config
 from dfsm.config import Config, load_config, parse_config
 from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
 from dfsm.derivatives import Filter, StateSpec
@@ -111,7 +111,7 @@ def test_files_are_found_from_the_folder_of_the_config(folder, tmp_path, monkeyp
     ("path", "value", "expected"),
     [
         (("sed",), 1, "unknown key 'sed'; did you mean 'seed'?"),
-        (("data", "strat"), 1, "unknown key 'data.strat'; did you mean 'start'?"),
+        (("data", "strat"), 1, "unknown key 'data.strat'; did you mean 'start' or 'train'?"),
         (("signals", "control"), ["u"], "unknown key 'signals.control'; did you mean 'controls'?"),
         (
             ("signals", "states", 0, "ordre"),
@@ -251,7 +251,7 @@ def test_values_without_sense_are_told_before_any_file_is_read(tmp_path, path, v
         ("a: 1\nb: c: d\n", "line 2: not valid YAML"),
         ("data: {}\ndata: {}\n", "line 2: not valid YAML .found duplicate key"),
         ("!!python/object/apply:os.system [ls]", "not valid YAML .could not determine a constr"),
-        ("data: " + "[" * 5000, "nested too deeply"),
+        ("data: " + "[" * 1500, "nested too deeply"),
         ("data: &a {train: [*a]}\nsignals: {states: []}", r"'data.train\[0\]': input should be"),
         ("1: 2\n", "key 'data' is missing"),
     ],

@@ -116,9 +116,7 @@ def test_unknown_keywords_are_refused(name):
         return
     with pytest.raises(TypeError, match=r"unexpected keyword argument|missing"):
         value(nonsense=1)
-    assert not [
-        p for p in inspect.signature(value).parameters.values() if p.kind is p.VAR_KEYWORD
-    ]
+    assert not [p for p in inspect.signature(value).parameters.values() if p.kind is p.VAR_KEYWORD]
 
 
 @pytest.mark.parametrize("name", [n for n in CLASSES if hasattr(OBJECTS[n], "__pydantic_config__")])

@@ -167,9 +167,14 @@ def _umask() -> int:
 def write_json(path: str | Path, value: object) -> None:
     """Write JSON atomically; numbers that are not finite become null, which JSON can hold."""
     with write_file(path) as temporary:
-        text = json.dumps(json_value(value), indent=2, allow_nan=False, ensure_ascii=False)
-        # What UTF-8 cannot hold (bytes of a foreign file name) becomes an escape that JSON knows.
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+        temporary.write_bytes(json_bytes(value))
+
+
+def json_bytes(value: object) -> bytes:
+    """Return what `write_json` writes."""
+    text = json.dumps(json_value(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    # What UTF-8 cannot hold (bytes of a foreign file name) becomes an escape that JSON knows.
+    return text.encode("utf-8", errors="backslashreplace")
 
 
 def json_value(value: object) -> object:

@@ -22,7 +22,7 @@ from safetensors.numpy import load_file, save_file
 import dfsm
 from dfsm.corrective import Corrective, GaussianUnits, Perceptron
 from dfsm.errors import DfsmError
-from dfsm.files import check_folder, json_value, write_folder, write_json
+from dfsm.files import check_folder, json_bytes, json_value, write_folder
 from dfsm.linear import LinearModel
 from dfsm.model import DFSM
 from dfsm.signals import Provenance, Region, SignalTable
@@ -63,7 +63,8 @@ def save(model: DFSM, path: str | Path, nonlinear: DFSM | None = None) -> None:
             "models": structure,
             "provenance": dict(model.provenance.record),
         }
-        write_json(folder / MANIFEST, {**manifest, "checksum": _checksum(manifest)})
+        manifest["checksum"] = _checksum(manifest)
+        (folder / MANIFEST).write_bytes(json_bytes(manifest))
 
 
 def check_target(path: str | Path) -> None:

@@ -276,7 +276,15 @@ def validate(
 
 
 def compared(model: DFSM, nonlinear: DFSM | None = None) -> dict[str, DFSM]:
-    """The models that belong side by side (Figs. 5, 6): linear fit, multi-fidelity, nonlinear."""
+    """The models that belong side by side (Figs. 5, 6): linear fit, multi-fidelity, nonlinear.
+
+    Parameters
+    ----------
+    model
+        The multi-fidelity model; its linear fit comes first.
+    nonlinear
+        The nonlinear-only model, if there is one.
+    """
     found = {"linear-fit": model.linear_fit(), "multi-fidelity": model}
     if nonlinear is not None:
         found["nonlinear-only"] = nonlinear
