@@ -275,7 +275,7 @@ def test_any_bytes_are_a_sentence(tmp_path_factory, raw):
 
 def test_missing_files_and_folders(tmp_path):
     for path in (tmp_path / "none.yaml", tmp_path):
-        with pytest.raises(DfsmError, match="cannot be read .*: make one with dfsm init"):
+        with pytest.raises(DfsmError, match=r"cannot be read .*: make one with dfsm init"):
             parse_config(path)
 
 

@@ -192,9 +192,9 @@ def _range(name: str, run: RunComparison, simulations: Sequence[Simulation]) -> 
 
 
 def _histogram(validation: Validation, name: str, blobs: Blobs) -> dict[str, Any] | None:
-    """Share of the samples per bin in %; None where no run was completed by all variants."""
+    """Share of samples per bin in %; None where the variants have no completed run in common."""
     found = validation.histograms[name]
-    if not all(counts.sum() for counts in found.counts.values()):
+    if not found.counts or not all(counts.sum() for counts in found.counts.values()):
         return None
     centres = (found.edges[1:] + found.edges[:-1]) / 2
     return {

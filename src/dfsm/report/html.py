@@ -21,7 +21,8 @@ from dfsm.validate import RunComparison, Validation
 
 _PSD_NOTE = "Welch's estimate, Hann windows of 200 s, unfiltered signals. "
 _ERRORS_NOTE = (
-    "Simulated minus recorded, all samples of the test runs that every variant completed; the "
+    "Simulated minus recorded, all samples of the test runs that every variant completed "
+    "(one that completed none is left out); the "
     "outermost bins hold what lies beyond."
 )
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}

@@ -267,7 +267,9 @@
     m.histograms.forEach((h, c) => {
       if (!h) return;
       const { name, unit } = m.channels[c];
-      const traces = shown().map(([variant, i]) => ({
+      // A variant that completed no run has no errors to count.
+      const counted = shown().filter(([variant]) => variant in h.share);
+      const traces = counted.map(([variant, i]) => ({
         ...line(variant, curve(i), width(i)),
         line: { color: curve(i), width: width(i), shape: "hvh" },
         x: array(h.x),
@@ -277,7 +279,7 @@
       list.push({ label: labelled(name), traces, x: unit ? `error (${unit})` : "error" });
     });
     if (!list.length) {
-      nothing("errors-plot", "No test run was completed by every variant, so there is nothing to compare.");
+      nothing("errors-plot", "The variants have no completed test run in common, so there is nothing to compare.");
       return;
     }
     clear("errors-plot");
