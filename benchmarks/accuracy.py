@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 DEMO = Path(__file__).parents[1] / "examples" / "iea15" / "demo.py"
+
+
+def demo() -> ModuleType:
+    """The demo as a module."""
+    spec = importlib.util.spec_from_file_location("iea15_demo", DEMO)
+    if spec is None or spec.loader is None:
+        raise FileNotFoundError(DEMO)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def run() -> dict[str, Any]:
@@ -18,11 +29,6 @@ def run() -> dict[str, Any]:
         Per fitted model and variant: rollouts completed, and mean NRMSE per channel (None where
         a rollout ended early).
     """
-    spec = importlib.util.spec_from_file_location("iea15_demo", DEMO)
-    if spec is None or spec.loader is None:
-        raise FileNotFoundError(DEMO)
-    demo = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(demo)
     return {
         label: {
             variant: {
@@ -34,5 +40,5 @@ def run() -> dict[str, Any]:
             }
             for variant in validation.models
         }
-        for label, (_, validation) in demo.study().items()
+        for label, (_, validation) in demo().study().items()
     }

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import dfsm
+from benchmarks.accuracy import demo
 from dfsm.corrective.functions import GaussianUnits
 from dfsm.linear import fit_linear
 from dfsm.model import DFSM
@@ -118,19 +119,7 @@ def start() -> dict[str, float]:
 
 
 def _settings() -> dfsm.FitSettings:
-    return dfsm.FitSettings(
-        states=(
-            dfsm.StateSpec(name="PtfmPitch", order=2),
-            dfsm.StateSpec(name="GenSpeed", order=2),
-        ),
-        controls=("GenTq", "BldPitch1"),
-        disturbances=("RotWind", "RotShearV", "RotShearH", "Wave1Elev"),
-        outputs=("TwrBsFxt", "TwrBsMyt", "GenPwr"),
-        linear=dfsm.LPV(schedule="RotWind"),
-        corrective=dfsm.RBF(samples=UNITS),
-        azimuth=dfsm.Azimuth(speed="GenSpeed", angle="LSSTipPxa"),
-        start=100.0,
-    )
+    return replace(demo().settings(5), corrective=dfsm.RBF(samples=UNITS))
 
 
 def _with_units(runs: list[dfsm.Trajectory]) -> DFSM:

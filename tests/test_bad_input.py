@@ -180,17 +180,6 @@ def test_an_input_that_never_varies(here, dfsm, role, name):
     assert said.startswith(f"{role} '{name}' is 0.25 throughout all 1 runs")
 
 
-def test_parameters_vary_between_runs_and_never_within(here, dfsm):
-    config = changed("signals", "parameters", value=["v"])
-    said = complaint(dfsm, config)
-    assert "parameter 'v' varies from" in said
-    assert said.endswith("list it as a disturbance")
-    altered(v=2.0)
-    config = trained_on("run.csv")
-    config["signals"]["parameters"] = ["v"]
-    assert complaint(dfsm, config).startswith("parameter 'v' is 2 throughout")
-
-
 def test_a_state_that_never_varies(here, dfsm):
     altered(q=1.5)
     assert "state 'q' is constant" in complaint(dfsm, trained_on("run.csv"))

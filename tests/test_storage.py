@@ -34,7 +34,7 @@ from dfsm.storage import load, load_all, save
 KINDS = {
     "rbf": RBF(samples=12),
     "gp": GP(samples=12),
-    "mlp": MLP(hidden=(4,), iterations=4),
+    "mlp": MLP(hidden=(4,), iterations=60),
     "none": NoCorrection(),
 }
 

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from dfsm.errors import DfsmError
 
@@ -177,7 +178,7 @@ def json_bytes(value: object) -> bytes:
     return text.encode("utf-8", errors="backslashreplace")
 
 
-def json_value(value: object) -> object:
+def json_value(value: Any) -> Any:
     """Turn nested mappings, sequences and numbers into what strict JSON can hold."""
     if isinstance(value, Mapping):
         return {str(k): json_value(v) for k, v in value.items()}

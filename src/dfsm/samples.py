@@ -154,7 +154,7 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
     data = Dataset(picked)
     for name in names:
         data.channel(name)
-    for name in (*choices.controls, *choices.disturbances, *choices.parameters):
+    for name in (*choices.controls, *choices.disturbances):
         windows = [r.window(choices.start, choices.stop)[name] for r in data]
         low, high = min(w.min() for w in windows), max(w.max() for w in windows)
         if low == high:
@@ -163,20 +163,7 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
                 f"can be learned about its effect: leave it out of {roles[name]}s, or add runs "
                 "in which it varies"
             )
-    _check_parameters(data, choices)
     return data
-
-
-def _check_parameters(data: Dataset, choices: FitSettings) -> None:
-    for run in data:
-        for name in choices.parameters:
-            values = run.window(choices.start, choices.stop)[name]
-            if np.ptp(values) > 1e-9 * np.abs(values).max():
-                raise DfsmError(
-                    f"{run.where}: parameter '{name}' varies from {values.min():g} to "
-                    f"{values.max():g}, but parameters are constant within a run: list it as a "
-                    "disturbance"
-                )
 
 
 def extract(data: Dataset, choices: FitSettings) -> Samples:

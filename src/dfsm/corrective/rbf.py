@@ -9,7 +9,7 @@ import numpy as np
 
 from dfsm.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
 from dfsm.corrective.units import gaussian_units, unit_sums
-from dfsm.linear import NormalEquations, merge
+from dfsm.least_squares import NormalEquations, merge
 from dfsm.sampling import Method, Subsample
 from dfsm.settings import require, settings
 from dfsm.types import Array, IntArray

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dfsm.corrective.functions import GaussianUnits
 from dfsm.corrective.training import TrainingSet
-from dfsm.linear import NormalEquations
+from dfsm.least_squares import NormalEquations
 from dfsm.types import Array
 
 _BLOCK = 8192

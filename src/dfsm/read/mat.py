@@ -10,7 +10,7 @@ import numpy as np
 
 from dfsm.errors import DfsmError
 from dfsm.read.assemble import assemble
-from dfsm.read.tables import TIME_NAMES, time_column
+from dfsm.read.columns import TIME_NAMES, time_column
 from dfsm.trajectory import Channel, Trajectory
 
 MAT_TIME_NAMES = (*TIME_NAMES, "tout")

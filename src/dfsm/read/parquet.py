@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dfsm.errors import DfsmError
 from dfsm.files import write_file
 from dfsm.read.assemble import assemble
-from dfsm.read.tables import SECONDS, split_header, time_column
+from dfsm.read.columns import SECONDS, split_header, time_column
 from dfsm.trajectory import Array, Channel, Role, Trajectory
 
 if TYPE_CHECKING:

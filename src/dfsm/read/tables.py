@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +15,10 @@ import numpy as np
 from dfsm.errors import DfsmError
 from dfsm.files import write_file
 from dfsm.read.assemble import assemble, existing_file
+from dfsm.read.columns import split_header, time_column
+from dfsm.read.mat import read_mat
+from dfsm.read.parquet import read_parquet, write_parquet
 from dfsm.trajectory import Channel, Trajectory
-
-# The name, one separator at most, and the unit in brackets at the end.
-HEADER = re.compile(r"(.+?)[_ ]?(?:\[([^\[\]]*)\]|\(([^()]*)\))")
-TIME_NAMES = ("time", "t")
-SECONDS = ("", "s", "sec", "second", "seconds")
 
 
 def read_table(path: str | Path) -> Trajectory:
@@ -51,12 +48,8 @@ def read_table(path: str | Path) -> Trajectory:
         start = stream.read(8)
     suffix = path.suffix.lower()
     if suffix in (".parquet", ".pq") or start.startswith(b"PAR1"):
-        from dfsm.read.parquet import read_parquet
-
         return read_parquet(path)
     if suffix == ".mat" or start.startswith((b"MATLAB", b"\x89HDF")):
-        from dfsm.read.mat import read_mat
-
         return read_mat(path)
     return _read_csv(path)
 
@@ -95,8 +88,6 @@ def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = Fals
     if suffix == ".csv":
         _write_csv(trajectory, path)
     else:
-        from dfsm.read.parquet import write_parquet
-
         write_parquet(trajectory, path, packed=packed)
 
 
@@ -113,37 +104,6 @@ def table_suffix(path: Path, *, packed: bool = False) -> str:
         kinds = ".parquet (the only kind that can be packed)" if packed else ".parquet or .csv"
         raise DfsmError(f"{path}: a table is written to {kinds}: choose a name that ends so")
     return suffix
-
-
-def split_header(text: str) -> tuple[str, str]:
-    """Split ``Name [unit]``, ``Name (unit)`` or ``Name_[unit]`` into name and unit ("" if none)."""
-    text = text.strip()
-    match = HEADER.fullmatch(text)
-    if match is None:
-        return text, ""
-    return match[1], (match[2] if match[2] is not None else match[3]).strip()
-
-
-def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TIME_NAMES) -> int:
-    """Return the column that holds the time.
-
-    Raises
-    ------
-    DfsmError
-        There is none, or its unit is not s.
-    """
-    for i, channel in enumerate(channels):
-        if channel.name.lower() in names:
-            if channel.unit.lower() not in SECONDS:
-                raise DfsmError(
-                    f"{path}: its time '{channel.name}' is in '{channel.unit}', expected s: "
-                    "convert it"
-                )
-            return i
-    shown = ", ".join(c.name for c in channels[:12]) + (", …" if len(channels) > 12 else "")
-    raise DfsmError(
-        f"{path}: no time column, expected one called Time, time or t (in s), found: {shown[:400]}"
-    )
 
 
 def _read_csv(path: Path) -> Trajectory:

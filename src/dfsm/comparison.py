@@ -1,0 +1,242 @@
+"""What a validation finds: models against recorded runs, and the figures of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dfsm.files import json_value
+from dfsm.model import DFSM
+from dfsm.simulate import Simulation, Status
+from dfsm.spectra import Spectrum
+from dfsm.trajectory import Channel, Trajectory
+from dfsm.types import Array, ComplexArray
+
+
+@dataclass(frozen=True)
+class ChannelStatistics:
+    """One signal of one run: figures that stand on their own, without a comparison.
+
+    Attributes
+    ----------
+    minimum, mean, maximum, std
+        In the channel's unit.
+    peaks
+        Peak frequency in Hz per band; None where the band holds no bin.
+    power
+        Variance per band in the unit squared; band ``0-0.3 Hz`` is always there.
+    damage
+        1 Hz damage-equivalent load per Wöhler exponent, outputs only.
+    spectrum
+        Welch's power spectral density.
+    """
+
+    minimum: float
+    mean: float
+    maximum: float
+    std: float
+    peaks: Mapping[str, float | None]
+    power: Mapping[str, float]
+    damage: Mapping[str, float]
+    spectrum: Spectrum
+
+
+@dataclass(frozen=True)
+class ChannelError:
+    """Error of a simulated signal against the recorded one.
+
+    Attributes
+    ----------
+    rmse, maximum
+        In the channel's unit.
+    nrmse
+        RMSE divided by the standard deviation of the recorded signal; infinite for a constant.
+    """
+
+    rmse: float
+    nrmse: float
+    maximum: float
+
+
+@dataclass(frozen=True)
+class ModelRun:
+    """One model on one test run.
+
+    Attributes
+    ----------
+    simulation
+        The rollout.
+    errors, statistics
+        Per channel; empty for a rollout that ended early, whose figures would flatter it.
+    derivative_errors
+        NRMSE of each state derivative along the recorded trajectory, by state name.
+    """
+
+    simulation: Simulation
+    errors: Mapping[str, ChannelError]
+    statistics: Mapping[str, ChannelStatistics]
+    derivative_errors: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """A test run and what every model made of it.
+
+    Attributes
+    ----------
+    recorded
+        The recorded states (smoothed as in the fit) and outputs in the test window.
+    statistics
+        Of the recorded channels.
+    models
+        By model name.
+    """
+
+    recorded: Trajectory
+    statistics: Mapping[str, ChannelStatistics]
+    models: Mapping[str, ModelRun]
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Pointwise errors of one channel over all test runs: counts between `edges`."""
+
+    edges: Array
+    counts: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Everything that a report shows.
+
+    Attributes
+    ----------
+    models
+        The models compared, by name, in the order shown.
+    channels
+        States and outputs, in the order shown.
+    runs
+        Test runs in the order given.
+    histograms
+        Per channel, over the runs that all models completed which completed any.
+    eigenvalues
+        Of the linear fit, per schedule point.
+    record
+        Provenance of the model: settings, data, rows, seconds.
+    warnings
+        What a reader should know before trusting the figures.
+    """
+
+    models: Mapping[str, DFSM]
+    channels: tuple[Channel, ...]
+    runs: tuple[RunComparison, ...]
+    histograms: Mapping[str, Histogram]
+    eigenvalues: Sequence[tuple[float, ComplexArray]]
+    record: Mapping[str, Any]
+    warnings: tuple[str, ...] = field(default=())
+
+    def mean_nrmse(self, model: str, channel: str) -> float | None:
+        """Mean NRMSE over the test runs; None if the model did not complete all of them."""
+        return self.mean_error(model, channel, "nrmse")
+
+    def mean_error(self, model: str, channel: str, what: str) -> float | None:
+        """Mean of one figure of `ChannelError` over the test runs, as `mean_nrmse`."""
+        found = [r.models[model].errors.get(channel) for r in self.runs]
+        values = [getattr(e, what) for e in found if e is not None]
+        return float(np.mean(values)) if len(values) == len(self.runs) else None
+
+    def endings(self) -> list[str]:
+        """One sentence per rollout that ended early."""
+        return [
+            f"{name} on {r.recorded.name}: {m.simulation.reason}"
+            for r in self.runs
+            for name, m in r.models.items()
+            if m.simulation.status is not Status.COMPLETED
+        ]
+
+    def completed(self, model: str) -> int:
+        """Number of test runs that a model simulated to the end."""
+        return sum(r.models[model].simulation.status is Status.COMPLETED for r in self.runs)
+
+    def wall_time(self, model: str) -> float:
+        """Mean wall time per rollout in s, compiled; one that ended early costs no less."""
+        return float(np.mean([r.models[model].simulation.wall_time for r in self.runs]))
+
+    def speed_up(self, model: str) -> float | None:
+        """Recorded wall time of the simulator over that of the model, if the runs carry it."""
+        times = [r.recorded.wall_time for r in self.runs]
+        known = [t for t in times if t is not None]
+        if len(known) < len(times):
+            return None
+        return float(np.mean(known)) / self.wall_time(model)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values: all figures, without time series and spectra; None where not finite."""
+        values = {
+            "format": 1,
+            "channels": [{"name": c.name, "unit": c.unit, "role": c.role} for c in self.channels],
+            "models": {name: self._model_dict(name) for name in self.models},
+            "runs": [_run_dict(r) for r in self.runs],
+            "histograms": {
+                name: {
+                    "edges": h.edges.tolist(),
+                    "counts": {m: c.tolist() for m, c in h.counts.items()},
+                }
+                for name, h in self.histograms.items()
+            },
+            "eigenvalues": [
+                {"schedule": s, "real": v.real.tolist(), "imag": v.imag.tolist()}
+                for s, v in self.eigenvalues
+            ],
+            "warnings": list(self.warnings),
+            "provenance": self.record,
+        }
+        return dict(json_value(values))
+
+    def _model_dict(self, name: str) -> dict[str, Any]:
+        return {
+            "completed": self.completed(name),
+            "of": len(self.runs),
+            "mean_nrmse": {c.name: self.mean_nrmse(name, c.name) for c in self.channels},
+            "wall_time_s": self.wall_time(name),
+            "speed_up": self.speed_up(name),
+        }
+
+
+def _run_dict(run: RunComparison) -> dict[str, Any]:
+    def statistics(found: Mapping[str, ChannelStatistics]) -> dict[str, Any]:
+        return {
+            name: {
+                "min": s.minimum,
+                "mean": s.mean,
+                "max": s.maximum,
+                "std": s.std,
+                "peaks_hz": dict(s.peaks),
+                "band_power": dict(s.power),
+                "del_1hz": dict(s.damage),
+            }
+            for name, s in found.items()
+        }
+
+    return {
+        "name": run.recorded.name,
+        "duration_s": run.recorded.duration,
+        "simulator_wall_time_s": run.recorded.wall_time,
+        "statistics": statistics(run.statistics),
+        "models": {
+            name: {
+                "status": m.simulation.status.name.lower(),
+                "message": m.simulation.message,
+                "ended_s": m.simulation.ended,
+                "outside": m.simulation.outside,
+                "wall_time_s": m.simulation.wall_time,
+                "errors": {c: asdict(e) for c, e in m.errors.items()},
+                "derivative_nrmse": dict(m.derivative_errors),
+                "statistics": statistics(m.statistics),
+            }
+            for name, m in run.models.items()
+        },
+    }
