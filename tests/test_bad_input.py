@@ -170,7 +170,7 @@ def test_the_same_run_twice(here, dfsm):
     assert "train/a.csv" in said
     # The same file named twice is one file.
     write_config(Path("c.yaml"), trained_on("copy.csv", "./copy.csv", "*.csv", corrective=NONE))
-    assert "fitted 1 runs" in dfsm("fit", "c.yaml", "-o", "m").out
+    assert "fitted 1 run in" in dfsm("fit", "c.yaml", "-o", "m").out
 
 
 @pytest.mark.parametrize(("role", "name"), [("control", "u"), ("disturbance", "w")])
@@ -192,7 +192,7 @@ def test_a_state_that_never_varies(here, dfsm):
     ("key", "value", "window"),
     [
         ("start", 100, r"(100.0 to … s)"),
-        ("stop", -1, "(1.0 to -1.0 s)"),
+        ("stop", 1.01, "(1.0 to 1.01 s)"),
         ("start", float("nan"), "(nan to … s)"),
     ],
 )
@@ -286,7 +286,7 @@ def test_validation_needs_the_outputs_and_simulation_does_not(here, dfsm, fitted
         (("--step", "0"), "the simulation step is 0.0 s, expected more than 0"),
         (("--step", "-1"), "the simulation step is -1.0 s"),
         (("--step", "nan"), "the simulation step is nan s"),
-        (("--start", "9", "--stop", "4"), "shorter than the time window"),
+        (("--start", "9", "--stop", "4"), "from 9 s to 4 s: swap the two"),
         (("--start", "soon"), "invalid value for '--start'"),
     ],
 )

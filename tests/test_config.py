@@ -159,7 +159,7 @@ def test_a_key_of_another_kind_is_not_suggested(tmp_path):
         (("signals", "states", 0, "order"), 3, "'signals.states[0].order': input should be 1 or 2"),
         (("linear",), "LTI", "'linear': keys and values were expected"),
         (("linear",), {}, "'linear' needs a key 'kind', one of 'LTI', 'LPV'"),
-        (("linear",), {"kind": "lti"}, "'linear' needs a key 'kind', one of 'LTI', 'LPV'"),
+        (("linear",), {"kind": "lti"}, "'linear.kind' is 'lti', expected one of 'LTI', 'LPV'; did"),
         (("linear",), {"kind": "LPV"}, "key 'linear.schedule' is missing"),
         (("corrective",), {"samples": 3}, "'corrective' needs a key 'kind', one of 'rbf', "),
         (("corrective",), {"kind": "mlp", "hidden": 4}, "'corrective.hidden': a list was expected"),

@@ -371,9 +371,9 @@ def test_summary_tells_signals_decisions_and_stability(duffing, linear):
     assert "q_ddot (m/s^2): corrected, residual" in text
     assert "z (m): linear fit, residual" in text
     assert "(80 points, length scales" in text
-    assert "check: 6 of 6 training runs tried simulate to their end" in text
+    assert "check: 6 of 6 training runs tried were simulated to their end" in text
     assert "UNSTABLE" not in text
-    assert "eigenvalues (1/s) at A: -0.3 ± 1.98i" in linear.model.summary()
+    assert "eigenvalues (1/s): -0.3 ± 1.98i" in linear.model.summary()
 
 
 def test_the_order_of_the_runs_does_not_change_a_bit(duffing, duffing_runs):

@@ -14,18 +14,15 @@ DATA = ROOT / "examples" / "iea15"
 
 
 @pytest.mark.filterwarnings("ignore::dfsm.errors.DfsmWarning")
-def test_python_example(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_python_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = (ROOT / "README.md").read_text(encoding="utf-8").split("```python")[1].split("```")[0]
-    assert len([line for line in code.splitlines() if line.strip()]) < 12
+    assert len([line for line in code.splitlines() if line.strip()]) < 10
     for folder, speed in (("runs", "06"), ("runs", "12"), ("test", "18")):
         (tmp_path / folder).mkdir(exist_ok=True)
         name = f"iea15_2dof_{speed}mps_s09.outb"
         shutil.copy(DATA / name, tmp_path / folder / name)
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
-    assert "linear fit: LPV in RotWind" in capsys.readouterr().out
     assert "my turbine" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 

@@ -96,7 +96,10 @@ def fit(
         return
     _say(_lines(result.model.summary()), quiet)
     seconds = sum(result.seconds.values())
-    _say(f"fitted {len(runs)} runs in {seconds:.1f} s, saved in {output}", quiet)
+    _say(
+        f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",
+        quiet,
+    )
 
 
 @app.command()

@@ -10,7 +10,7 @@ import numpy as np
 
 from dfsm.files import json_value
 from dfsm.model import DFSM
-from dfsm.simulate import Simulation, Status
+from dfsm.simulate import MUCH_OUTSIDE, Simulation, Status
 from dfsm.spectra import Spectrum
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.types import Array, ComplexArray
@@ -156,6 +156,18 @@ class Validation:
             for name, m in r.models.items()
             if m.simulation.status is not Status.COMPLETED
         ]
+
+    def outside(self) -> list[str]:
+        """One sentence per model that spent much of its time outside the training range."""
+        found = []
+        for name in self.models:
+            shares = [r.models[name].simulation.outside for r in self.runs]
+            if max(shares) > MUCH_OUTSIDE:
+                found.append(
+                    f"{name}: up to {max(shares):.0%} of a rollout has an input or state outside "
+                    "the training range"
+                )
+        return found
 
     def completed(self, model: str) -> int:
         """Number of test runs that a model simulated to the end."""

@@ -150,7 +150,11 @@ def _explain(error: ValidationError, raw: dict[str, Any]) -> str:
         return f"key '{where}' is missing"
     if first["type"].startswith("union_tag"):
         kinds = ", ".join(f"'{kind}'" for kind in _kinds(keys))
-        return f"'{where}' needs a key 'kind', one of {kinds}"
+        given = first["input"].get("kind") if isinstance(first["input"], dict) else None
+        if given is None:
+            return f"'{where}' needs a key 'kind', one of {kinds}"
+        hint = near_matches(str(given), _kinds(keys))
+        return f"'{where}.kind' is '{given}', expected one of {kinds}; {hint}"
     found = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
     message = _MESSAGES.get(first["type"], first["msg"])
     return f"'{where}': {message[0].lower()}{message[1:]}{found}"

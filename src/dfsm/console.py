@@ -64,11 +64,17 @@ def print_validations(found: Mapping[str, Validation]) -> None:
                 for what in ("rmse", "maximum")
             ]
             table.add_row(*row, end_section=i == len(validation.channels) - 1)
+    for label, validation in found.items():
+        prefix = f"{label}: " if several else ""
+        for text in validation.warnings:
+            console.print(_text(f"{prefix}{text}"))
     console.print(
         "NRMSE: RMS error / standard deviation of the recorded signal, mean over test runs"
     )
     console.print(table)
-    console.print("* of the multi-fidelity model, in the channel's unit; – a rollout ended early")
+    console.print(
+        "* of the multi-fidelity model, in the channel's unit; – no mean, a rollout ended early"
+    )
     times = _table(
         *(["model"] if several else []), "variant", "rollouts done", "wall time", "speed-up"
     )
@@ -80,13 +86,13 @@ def print_validations(found: Mapping[str, Validation]) -> None:
                 variant,
                 f"{validation.completed(variant)} of {len(validation.runs)}",
                 f"{1000 * validation.wall_time(variant):.0f} ms",
-                "–" if speed is None else f"{speed:,.0f} ×",
+                "no wall time known" if speed is None else f"{speed:,.0f} ×",
             ]
             times.add_row(*row)
     console.print(times)
     for label, validation in found.items():
         prefix = f"{label}: " if several else ""
-        for text in (*validation.warnings, *validation.endings()):
+        for text in (*validation.endings(), *validation.outside()):
             console.print(_text(f"{prefix}{text}"))
 
 

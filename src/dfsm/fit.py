@@ -244,12 +244,12 @@ def _correct(
         elif i in large:
             text = (
                 f"corrected, residual {ratio[i]:.1%} of the signal, of whose variance "
-                f"{explained[i]:.1%} is explained on left-out runs ({detail})"
+                f"{explained[i]:.1%} is explained in cross-validation ({detail})"
             )
         elif i in explained:
             text = (
                 f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains only "
-                f"{max(explained[i], 0.0):.1%} of its variance on left-out runs"
+                f"{max(explained[i], 0.0):.1%} of its variance in cross-validation"
             )
         else:
             text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
@@ -362,7 +362,7 @@ def _check(
         warnings.simplefilter("ignore", DfsmWarning)
         rollouts = simulate(model, some, start=choices.start, stop=choices.stop)
     done = sum(r.status is Status.COMPLETED for r in rollouts)
-    checks = [f"{done} of {len(some)} training runs tried simulate to their end"]
+    checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]
     if done < len(some):
         worst = min(
             (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended

@@ -266,10 +266,10 @@ class DFSM(eqx.Module):
         for row in record.get("rows", []):
             lines.append(f"  {row['name']} ({row['unit']}): {row['decision']}")
         for point, values in self.eigenvalues():
-            where = f"{self.schedule} = {point:.4g}" if self.schedule else "A"
+            where = f" at {self.schedule} = {point:.4g}" if self.schedule else ""
             listed = ", ".join(_complex(v) for v in values if v.imag >= 0)
             unstable = "  UNSTABLE" if values.real.max() > 0 else ""
-            lines.append(f"  eigenvalues (1/s) at {where}: {listed}{unstable}")
+            lines.append(f"  eigenvalues (1/s){where}: {listed}{unstable}")
         lines += [f"check: {text}" for text in record.get("checks", [])]
         lines += [f"warning: {text}" for text in record.get("warnings", [])]
         return "\n".join(lines)

@@ -29,6 +29,8 @@ from dfsm.types import Array
 
 # A rollout ends where a state is this many times its training half-range from the middle.
 _ESCAPE = 10.0
+# Share of the time outside the training range above which a user is warned.
+MUCH_OUTSIDE = 0.05
 # Rates at the start are taken from this many seconds of the record before it (or, where the
 # record starts there, just after it): long enough for a derivative, too short to leak a response.
 _HISTORY = 20.0
@@ -317,12 +319,12 @@ def _warn(results: Sequence[Simulation]) -> None:
     ended = [r for r in results if r.status is not Status.COMPLETED]
     for r in ended:
         warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=3)
-    outside = [r for r in results if r.status is Status.COMPLETED and r.outside > 0.05]
+    outside = [r for r in results if r.status is Status.COMPLETED and r.outside > MUCH_OUTSIDE]
     if outside:
         worst = max(outside, key=lambda r: r.outside)
         warnings.warn(
-            f"{len(outside)} of {len(results)} rollouts spend more than 5 % of the time outside "
-            f"the training range, {worst.trajectory.name} most ({worst.outside:.1%})",
+            f"{len(outside)} of {len(results)} rollouts spend more than {MUCH_OUTSIDE:.0%} of the "
+            f"time outside the training range, {worst.trajectory.name} most ({worst.outside:.1%})",
             DfsmWarning,
             stacklevel=3,
         )

@@ -54,8 +54,8 @@ linear:
 {linear}
 
 corrective:
-  kind: rbf           # rbf, rbf_incremental, gp, mlp or none
-  samples: 200        # units
+  kind: rbf           # rbf, rbf_incremental, gp, mlp or none; docs/method.md lists their keys
+  samples: 200        # units (not for mlp and none: remove the three lines below kind)
   sampling: kmeans    # kmeans, maxmin or random
   targets: all        # or cluster_means, as in the paper
 
@@ -128,7 +128,7 @@ _WIND_NOTE = """
   # replace RtVAvgxh by RtVAvgxhCorr here and in linear.schedule."""
 
 _LPV = """\
-  kind: LPV           # LPV: coefficients vary with the schedule; LTI: they do not
+  kind: LPV           # LPV varies with the schedule; LTI does not (remove schedule, points)
   schedule: {schedule}
   points: 5
 {margin}"""

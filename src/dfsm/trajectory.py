@@ -205,6 +205,8 @@ class Trajectory:
         slack = 1e-9 * self.duration
         lo = -np.inf if start is None else start - slack
         hi = np.inf if stop is None else stop + slack
+        if start is not None and stop is not None and start >= stop:
+            raise DfsmError(f"the time window goes from {start:g} s to {stop:g} s: swap the two")
         keep = (self.time >= lo) & (self.time <= hi)
         if keep.sum() < 2:
             raise DfsmError(

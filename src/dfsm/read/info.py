@@ -129,8 +129,19 @@ def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
     )
 
 
+# Steps this many times the usual one are a hole in the record, not an adaptive mesh.
+_GAP = 20.0
+
+
 def _warnings(trajectory: Trajectory) -> list[str]:
     found = []
+    steps = np.diff(trajectory.time)
+    gap = int(np.argmax(steps))
+    if steps[gap] > _GAP * np.median(steps):
+        found.append(
+            f"there is a gap of {steps[gap]:g} s after {trajectory.time[gap]:g} s: a fit would "
+            "bridge it with a spline"
+        )
     seen: dict[bytes, str] = {}
     for name, values in zip(trajectory.names, trajectory.values.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
