@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
     from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.errors import DfsmError, DfsmWarning
+    from dfsm.excitation import Chirp, Multisine, RandomKnots, RandomSteps, Uniform, excite
     from dfsm.fit import FitResult, fit
     from dfsm.linear import LPV, LTI
     from dfsm.model import DFSM
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
     from dfsm.samples import FitSettings
     from dfsm.signals import Azimuth
     from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
+    from dfsm.simulators import (
+        ODESystem,
+        mass_chain,
+        two_link_robot,
+        two_link_robot_with_gravity,
+    )
     from dfsm.steady import SteadyState, steady_state
     from dfsm.storage import load, load_all, save
     from dfsm.trajectory import Channel, Dataset, Trajectory
@@ -43,6 +50,16 @@ _HOME = {
     "read_all": "read",
     "write_table": "read",
     "describe": "read",
+    "RandomKnots": "excitation",
+    "RandomSteps": "excitation",
+    "Multisine": "excitation",
+    "Chirp": "excitation",
+    "Uniform": "excitation",
+    "excite": "excitation",
+    "ODESystem": "simulators",
+    "two_link_robot": "simulators",
+    "two_link_robot_with_gravity": "simulators",
+    "mass_chain": "simulators",
     "StateSpec": "derivatives",
     "Filter": "derivatives",
     "DerivativeSettings": "derivatives",
