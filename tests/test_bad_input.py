@@ -6,6 +6,7 @@ import errno
 import importlib
 import json
 import os
+import re
 import shutil
 import struct
 from dataclasses import replace
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import CONFIG, changed, files_of, write_config
+from conftest import CONFIG, changed, files_of, renamed, write_config
 from dfsm.read import read, write_table
 from dfsm.trajectory import Trajectory
 from outb import outb_bytes, smooth_run
@@ -134,6 +135,34 @@ def test_unknown_channels_in_every_role(here, dfsm, role):
     assert said.startswith("train/a.csv: ")
 
 
+def test_all_missing_channels_are_told_at_once(here, dfsm, fitted):
+    run = read("train/a.csv")
+    names = {"q": "PtfmPitch", "u": "GenTq", "w": "RotWind", "y": "GenPwr"}
+    write_table(renamed(run, names), "r.csv")
+    config = trained_on("r.csv", "train/b.parquet")
+    config["signals"] |= {
+        "states": [{"name": "ptfmpitch", "order": 2, "rate": "v_recorded"}],
+        "controls": ["Tq"],
+        "disturbances": ["RotWnd"],
+        "outputs": ["z", "Power"],
+    }
+    assert complaint(dfsm, config) == (
+        "r.csv: no channels 'ptfmpitch' (did you mean 'PtfmPitch'?), 'v_recorded', "
+        "'Tq' (did you mean 'GenTq'?), 'RotWnd' (did you mean 'RotWind'?), 'Power'; known are: "
+        "PtfmPitch, v, GenTq, RotWind, GenPwr, z"
+    )
+    config["signals"] |= {"states": [{"name": "ptfmpitch"}], "controls": [], "outputs": ["tq"]}
+    assert complaint(dfsm, config) == (
+        "r.csv: no channels 'ptfmpitch' (did you mean 'PtfmPitch'?), "
+        "'RotWnd' (did you mean 'RotWind'?), 'tq' (did you mean 'GenTq'?)"
+    )
+    known = "known are: PtfmPitch, v, GenTq, RotWind, GenPwr, z"
+    said = dfsm("simulate", fitted, "r.csv", "-o", "o.csv").sentence
+    assert said == f"r.csv: no channels 'u', 'w', 'q'; {known}"
+    said = dfsm("validate", fitted, "test/d.outb", "r.csv").sentence
+    assert said == f"r.csv: no channels 'u', 'w', 'q', 'y'; {known}"
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["q", "u", "w", "y"])
 def test_a_used_channel_that_is_not_finite(here, dfsm, name, bad):
@@ -178,6 +207,27 @@ def test_an_input_that_never_varies(here, dfsm, role, name):
     altered(**{name: 0.25})
     said = complaint(dfsm, trained_on("run.csv"))
     assert said.startswith(f"{role} '{name}' is 0.25 throughout all 1 runs")
+
+
+def test_a_parameter_that_varies_within_a_run(here, dfsm):
+    config = changed("signals", "parameters", value=["v"])
+    said = complaint(dfsm, config)
+    assert re.fullmatch(
+        r"train/.*: parameter 'v' goes from -?[\d.]+ to [\d.]+ m/s, but parameters are constant "
+        "within a run: give it as a disturbance or control",
+        said,
+    )
+    # Only what is used counts: here it changes before the window.
+    for file in ("train/a.csv", "train/b.parquet"):
+        run = read(file)
+        values = run.values.copy()
+        values[:, run.column("v")] = np.where(run.time < 0.5, 7.0, len(file))
+        write_table(replace(run, values=values), Path(file).with_suffix(".csv").name)
+    config |= {"corrective": NONE}
+    config["data"]["train"] = ["a.csv", "b.csv"]
+    write_config(Path("c.yaml"), config)
+    assert dfsm("fit", "c.yaml", "-o", "m").code == 0
+    assert "parameter 'v' goes from" in dfsm("simulate", "m", "test/d.outb", "-o", "o.csv").sentence
 
 
 def test_a_state_that_never_varies(here, dfsm):
@@ -253,7 +303,8 @@ def test_an_output_that_is_a_state(here, dfsm):
 def test_a_binary_file_or_a_folder_as_config(here, dfsm):
     said = dfsm("fit", "train/c.outb", "-o", "m").sentence
     assert said.startswith("train/c.outb is not valid YAML")
-    assert dfsm("fit", "train", "-o", "m").sentence.startswith("train cannot be read")
+    said = dfsm("fit", "train", "-o", "m").sentence
+    assert said.startswith("train is a folder, a configuration file was expected")
     assert dfsm("fit", "none.yaml", "-o", "m").sentence.startswith("none.yaml cannot be read")
     assert not Path("m").exists()
 
@@ -273,7 +324,7 @@ def test_a_run_that_lacks_what_drives_the_model(here, dfsm, fitted, name):
 def test_validation_needs_the_outputs_and_simulation_does_not(here, dfsm, fitted):
     write_table(read("test/d.outb").select(["q", "u", "w"]), "r.csv")
     said = dfsm("validate", fitted, "r.csv", "-o", "r.html", "--json", "r.json").sentence
-    assert said.startswith("r.csv: no channel 'y'; known are: q, u, w")
+    assert said == "r.csv: no channels 'y', 'z'; known are: q, u, w"
     assert files_of(here).keys() == {"r.csv"}
     assert dfsm("simulate", fitted, "r.csv", "-o", "o.csv").code == 0
     assert read("o.csv").names == ("q", "q_dot", "y", "z")
@@ -286,6 +337,8 @@ def test_validation_needs_the_outputs_and_simulation_does_not(here, dfsm, fitted
         (("--step", "0"), "the simulation step is 0.0 s, expected more than 0"),
         (("--step", "-1"), "the simulation step is -1.0 s"),
         (("--step", "nan"), "the simulation step is nan s"),
+        (("--step", "1e-9"), "steps of 1e-09 s over 14 s make 1.4e+10 steps, at most 10,000,000"),
+        (("--step", "1e-320"), "make inf steps"),
         (("--start", "9", "--stop", "4"), "from 9 s to 4 s: swap the two"),
         (("--start", "soon"), "invalid value for '--start'"),
     ],
@@ -301,6 +354,11 @@ def test_wall_times_that_are_none(here, dfsm, fitted):
         said = dfsm("validate", fitted, "test/d.outb", "--wall-times", "w.json").sentence
         assert said == "w.json is not a JSON table of run names and seconds"
     assert "no such file" in dfsm("validate", fitted, "test/d.outb", "--wall-times", "x").sentence
+    for value in ("-3", "0", "NaN", "Infinity"):
+        Path("w.json").write_text(f'{{"c": 1, "d": {value}}}')
+        said = dfsm("validate", fitted, "test/d.outb", "--wall-times", "w.json").sentence
+        assert said.startswith(f"w.json: the wall time of 'd' is {value.lower()[:3]}")
+        assert "expected a positive number" in said
 
 
 @pytest.mark.parametrize("command", ["summary", "validate", "simulate"])

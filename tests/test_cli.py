@@ -218,8 +218,12 @@ def test_fit_prints_a_summary_and_saves(here, dfsm, folder):
     assert shown.out.startswith("states: q (m), q_dot (m/s)\ncontrols: u (N)\n")
     assert shown.out.splitlines()[-1].startswith("fitted 3 runs in ")
     assert sorted(p.name for p in Path("m").iterdir()) == ["manifest.json", "model.safetensors"]
-    # A model folder, and only that, may be replaced.
-    assert dfsm("fit", "config.yaml", "-o", "m", "--quiet").out == ""
+    # A model folder, and only that, may be replaced, which is told.
+    again = dfsm("fit", "config.yaml", "-o", "m")
+    assert (again.code, again.err) == (0, "note: replaced the model that was in m\n")
+    quiet = dfsm("fit", "config.yaml", "-o", "m", "--quiet")
+    assert (quiet.out, quiet.err) == ("", "")
+    Path("m2").mkdir()
     machine = dfsm("fit", "config.yaml", "-o", "m2", "--json")
     assert machine.err == ""
     record = json.loads(machine.out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -274,9 +275,16 @@ def test_any_bytes_are_a_sentence(tmp_path_factory, raw):
 
 
 def test_missing_files_and_folders(tmp_path):
-    for path in (tmp_path / "none.yaml", tmp_path):
-        with pytest.raises(DfsmError, match=r"cannot be read .*: make one with dfsm init"):
-            parse_config(path)
+    with pytest.raises(DfsmError, match=r"none\.yaml cannot be read .*: make one with dfsm init"):
+        parse_config(tmp_path / "none.yaml")
+    folder = re.escape(f"{tmp_path} is a folder, a configuration file was expected: ")
+    with pytest.raises(DfsmError, match=folder + "name one, or use dfsm init"):
+        parse_config(tmp_path)
+    for name in ("other.yml", "config.yaml", "third.yaml"):  # config.yaml wins over any other
+        (tmp_path / name).touch()
+        meant = "other.yml" if name == "other.yml" else "config.yaml"
+        with pytest.raises(DfsmError, match=folder + rf"did you mean .*{meant}\?"):
+            parse_config(tmp_path)
 
 
 def test_the_example_of_these_tests_is_complete(tmp_path):

@@ -58,6 +58,15 @@ def test_constant_nan_duplicate_and_invalid_channels_are_told():
     assert (gap.min, gap.max, gap.mean, gap.std) == (1, 3, 2, 1)
 
 
+def test_a_gap_is_told():
+    t = np.append(np.arange(0, 10, 0.1), np.arange(14, 20, 0.1))
+    (text,) = describe(Trajectory(t, np.sin(t)[:, None], (Channel("a"),))).warnings
+    assert text.startswith("there is a gap of 4.1 s after 9.9 s, which a fit bridges with a spline")
+    adaptive = np.cumsum(np.geomspace(0.01, 0.15, 100))
+    run = Trajectory(adaptive, np.sin(adaptive)[:, None], (Channel("a"),))
+    assert describe(run).warnings == ()
+
+
 def test_to_dict_is_strict_json():
     t = np.array([0.0, 1.0, 2.5])
     run = Trajectory(t, np.array([[np.nan, 1]] * 3), (Channel("none"), Channel("one", "m", 0.5)))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -435,6 +438,74 @@ def test_units_that_differ_are_refused(linear_runs):
     )
     with pytest.raises(DfsmError, match=r"channel 'w' is in '(m/s|ft/s)' in .*csv but in '"):
         fit([linear_runs[0], odd], LINEAR)
+
+
+def test_a_gap_in_the_window_is_warned_of(linear_runs):
+    def cut(run):
+        keep = (run.time < 10) | (run.time > 11.2)
+        return replace(run, time=run.time[keep], values=run.values[keep])
+
+    runs = [cut(linear_runs[0]), *linear_runs[1:]]
+    choices = replace(LINEAR, corrective=NoCorrection())
+    with pytest.warns(
+        DfsmWarning, match=r"^runs/run0_0\.csv: there is a gap of 1\.25 s after 9\."
+    ) as told:
+        model = fit(runs, choices).model
+    assert len(told) == 1
+    assert "warning: runs/run0_0.csv: there is a gap" in model.summary()
+    with pytest.warns(DfsmWarning, match=r"without it \(2 of the 4 runs have gaps\)$"):
+        fit([cut(runs[1]), *runs[:1], *runs[2:]], choices)
+    fit(runs, replace(choices, start=13.5))
+
+
+def test_a_parameter_with_one_value_in_all_runs_is_warned_of():
+    runs = SPRING.many(2, [(0, 3), (3.0, 0)], TIME, seed=10)
+    choices = replace(
+        LINEAR, disturbances=(), parameters=("k",), corrective=NoCorrection(), nonlinear_only=False
+    )
+    with pytest.warns(DfsmWarning, match="^input 'k' has the same value in all samples") as told:
+        model = fit(runs, choices).model
+    assert len(told) == 1
+    np.testing.assert_array_equal(np.asarray(model.f.coefficients)[0, :, -1], 0)
+    assert np.isfinite(model.provenance.record["condition"])
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (-0.3, "a correction explains nothing on data left out of its training"),
+        (0.0004, "a correction explains nothing on data left out of its training"),
+        (0.004, "a correction explains only 0.4% of its variance in cross-validation"),
+    ],
+)
+def test_a_correction_that_is_not_worthwhile(duffing_runs, monkeypatch, share, text):
+    def trained(inputs, residuals, *_):
+        return SimpleNamespace(explained=np.full(residuals.shape[1], share), detail="")
+
+    monkeypatch.setattr(importlib.import_module("dfsm.fit"), "fit_corrective", trained)
+    choices = replace(LINEAR, states=SECOND, outputs=("y", "z"), nonlinear_only=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        model = fit(duffing_runs, choices).model
+    assert model.e is model.e_g is None
+    for name in ("q_ddot", "y"):
+        assert decision(model, name)["decision"].endswith(text)
+
+
+def test_models_print_in_one_line(linear, duffing, scheduled):
+    groups = "controls u (N); disturbances w (m/s)"
+    assert repr(duffing.model) == (
+        "<DFSM: LTI, 1 of 2 derivatives and 1 of 2 outputs corrected; states q (m), q_dot (m/s); "
+        f"{groups}; outputs y (kN), z (m)>"
+    )
+    assert repr(scheduled).startswith("<DFSM: LPV in w, 0 of 2 derivatives and 0 of 1 outputs")
+    assert re.fullmatch(
+        rf"<FitResult after \d+\.\d s: {re.escape(repr(linear.model))}>", repr(linear)
+    )
+    kept = replace(linear, nonlinear=linear.model)
+    assert repr(kept).endswith(">, and a nonlinear-only model>")
+    # Where only the structure is left, as inside JAX, it prints too.
+    assert repr(jax.tree.map(lambda _: None, scheduled)) == repr(scheduled)
 
 
 def test_a_channel_in_two_roles_is_refused(linear_runs):

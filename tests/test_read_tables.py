@@ -88,7 +88,12 @@ def test_csv_time_column_anywhere(tmp_path, time):
         ("t,y\n1,2\n3\n", "line 3: 1 values, but the header names 2"),
         ("t,y\n1,2\n\n3,4,5\n", "line 4: 3 values"),
         ("t,y\n1,2\n2,****\n", r"line 3: '\*\*\*\*' in column 2 is no number"),
-        ("t;y\n1;2,5\n2;3\n", "line 2: '2,5' in column 2 is no number: .*point"),
+        ("t;y\n1;2,5\n2;3\n", "'2,5' in column 2 is no number: decimals have a comma here, save"),
+        ("t\ty\n1\t,5E-3\n2\t3\n", "',5E-3' in column 2 is no number: decimals have a comma"),
+        ("t;y\n1;2,5,1\n2;3\n", "'2,5,1' in column 2 is no number: correct it"),
+        ("t,y\n0,0\n0,1,2,5\n", "line 3: 4 values, .*: if its decimals have commas, save it with"),
+        ("t,y\n0,0\n1,-2,5\n", "line 3: 3 values, .*: if its decimals have commas"),
+        ("t,y\n0,0\n1,2.5,3\n", "line 3: 3 values, .* 2 columns: correct or remove the line"),
         ("t,y\n1,2\n1,3\n", "time repeats at sample 1"),
         ("t,y\n", "0 samples"),
         ("t,y\n1,2\n", "1 samples"),
@@ -107,6 +112,41 @@ def test_csv_duplicates_and_invalid(tmp_path):
     run = read(text(tmp_path / "a.csv", "t,x,x,x,Invalid\n0,1,1,9,0\n1,2,2,8,0\n"))
     assert run.names == ("x", "x#2")
     assert len(run.notes) == 3
+
+
+@pytest.mark.parametrize("kind", ["csv", "reread", "sliced", "parquet"])
+def test_the_index_of_a_saved_table_is_no_channel(tmp_path, kind):
+    path = tmp_path / ("a.parquet" if kind == "parquet" else "a.csv")
+    frame = pd.DataFrame({"Time": np.arange(6) / 2, "A": np.arange(6) ** 2, "index": np.arange(6)})
+    if kind in ("sliced", "parquet"):
+        frame = frame.iloc[[1, 2, 4, 5]]
+    if kind == "parquet":
+        frame.to_parquet(path)
+        assert "__index_level_0__" in pq.read_table(path).column_names
+    else:
+        frame.to_csv(path)
+        assert path.read_text().startswith(",Time")
+    if kind == "reread":
+        pd.read_csv(path).to_csv(path, index=False)
+        assert path.read_text().startswith("Unnamed: 0,Time")
+    run = read(path)
+    assert run.names == ("A", "index")  # a column that has a name stays
+    assert np.array_equal(run["A"], frame["A"])
+    number = 4 if kind == "parquet" else 1
+    assert run.notes == (f"column {number} left out: it numbers the rows, as a saved index does",)
+
+
+def test_other_columns_without_a_name(tmp_path):
+    path = tmp_path / "a.csv"
+    run = read(text(path, "t,x,\n0,1,\n1,2,\n"))
+    assert run.names == ("x",)
+    assert run.notes == ("column 3 left out: it has no name and no values",)
+    for column in (("0.5", "1.5"), ("3", "1"), ("2", ""), ("inf", "inf")):
+        rows = "".join(f"{i},{i},{v}\n" for i, v in enumerate(column))
+        fails(text(path, "t,x, \n" + rows), "column 3 has no name: give it one in the header")
+    assert read(text(path, "t,Unnamed: 3\n0,0.5\n1,0.7\n")).names == ("Unnamed: 3",)
+    # An index without a name may well be the time, but that is not for a reader to guess.
+    fails(text(path, ",x\n0.0,1\n0.5,2\n"), r"no time column, .* found: \(no name\), x")
 
 
 def test_csv_round_trip_keeps_every_digit(tmp_path):
@@ -275,6 +315,9 @@ def test_writing_refuses_what_it_cannot_keep(tmp_path):
     clash = replace(run, channels=(Channel("Time"), *run.channels[1:]))
     with pytest.raises(DfsmError, match="a channel called 'Time'"):
         write_table(clash, tmp_path / "a.parquet")
+    nameless = replace(run, channels=(Channel(" "), *run.channels[1:]))
+    with pytest.raises(DfsmError, match="a channel has no name"):
+        write_table(nameless, tmp_path / "a.parquet")
     odd = replace(run, channels=(Channel("A", "[m]"), *run.channels[1:]))
     with pytest.raises(DfsmError, match=r"write \.parquet instead"):
         write_table(odd, tmp_path / "a.csv")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -344,3 +345,28 @@ def test_bad_settings_are_refused():
     for step in (0.0, -0.1, np.nan):
         with pytest.raises(DfsmError, match="simulation step"):
             SimulationSettings(step=step)
+
+
+def test_more_steps_than_memory_holds_are_refused(monkeypatch):
+    run = recorded(np.sort(np.append(EVEN, [0.03, 0.05])))  # the longest of 62 intervals is 0.2 s
+    monkeypatch.setattr(integrate, "_MOST_STEPS", 1000)
+    with pytest.raises(DfsmError, match=r"of 0\.0001 s over 12 s make 1.24e\+05 steps") as caught:
+        simulate(MODEL, run, options=SimulationSettings(step=1e-4))
+    allowed = float(re.search(r"at least (\S+) s", str(caught.value))[1])
+    assert integrate.mesh_of(run, allowed, "linear").steps <= 1000
+    with pytest.raises(DfsmError, match="a shorter time window"):
+        integrate.mesh_of(run, 0.9 * allowed, "linear")
+    assert integrate.mesh_of(run, None, "linear").steps == 62
+    # A run that has more samples than that is nothing that a step could change.
+    monkeypatch.setattr(integrate, "_MOST_STEPS", 10)
+    assert integrate.mesh_of(run, None, "linear").steps == 62
+    with pytest.raises(DfsmError, match=r"at least 0\.202 s"):
+        integrate.mesh_of(run, 0.1, "linear")
+
+
+def test_a_simulation_prints_in_one_line():
+    result = simulate(MODEL, recorded(EVEN))
+    assert repr(result) == (
+        "<Simulation of run0: completed, 0 to 12 s, 61 samples; "
+        f"{result.outside:.1%} of the time outside the training range>"
+    )

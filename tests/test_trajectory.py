@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, near_matches
 from dfsm.trajectory import Channel, Dataset, Trajectory
 
 A, B, C = Channel("PtfmPitch", "deg", 0.01), Channel("GenSpeed", "rpm"), Channel("GenTq", "kN-m")
@@ -21,6 +21,53 @@ def make(seed: int = 0, samples: int = 101, channels=(A, B, C), **more) -> Traje
     values = rng.normal(size=(samples, len(channels)))
     more = {"name": f"run{seed}", "source": f"runs/run{seed}.outb", **more}
     return Trajectory(0.1 * np.arange(samples), values, channels, **more)
+
+
+# -- how names are missed, and how runs print --------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "hint"),
+    [
+        ("genspeed", ["RotSpeed", "GenSpeed"], "did you mean 'GenSpeed'?"),
+        ("Tq", ["GenTq", "GenPwr"], "did you mean 'GenTq'?"),
+        ("RotWind_mean_of_ten_minutes", ["RotWind", "GenTq"], "did you mean 'RotWind'?"),
+        ("bld", ["BldPitch1", "Azimuth", "BldPitch2"], "did you mean 'BldPitch1' or 'BldPitch2'?"),
+        ("velocity", ["v", "q"], "known are: v, q"),
+        ("x", [], "none are known"),
+    ],
+)
+def test_near_matches(name, known, hint):
+    assert near_matches(name, known) == hint
+
+
+def test_all_missing_channels_are_told():
+    for lookup in (
+        lambda: make().select(["xyz", "gentq", "GenSpeed", "xyz"]),
+        lambda: make().with_roles({"xyz": "state", "gentq": "control"}),
+    ):
+        with pytest.raises(DfsmError) as caught:
+            lookup()
+        assert str(caught.value) == (
+            "runs/run0.outb: no channels 'xyz', 'gentq' (did you mean 'GenTq'?); "
+            "known are: PtfmPitch, GenSpeed, GenTq"
+        )
+
+
+def test_runs_print_in_one_line():
+    channels = "PtfmPitch (deg), GenSpeed (rpm), GenTq (kN-m)"
+    assert repr(make()) == (
+        f"<Trajectory run0: 101 samples, 0 to 10 s, every 0.1 s; 3 channels: {channels}>"
+    )
+    assert repr(Dataset([make(0), make(1, channels=(A, C))])) == (
+        "<Dataset: 2 runs, 202 samples, 20 s; 2 channels in every run: "
+        "PtfmPitch (deg), GenTq (kN-m)>"
+    )
+    many = Trajectory(
+        np.array([0, 1, 3]), np.zeros((3, 99)), tuple(Channel(f"\x1b{i}") for i in range(99))
+    )
+    assert "0 to 3 s, irregular; 99 channels: \\x1b0, " in repr(many)
+    assert repr(many).endswith(", \\x1b7, …>")
 
 
 # -- one run ------------------------------------------------------------------------------------

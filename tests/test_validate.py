@@ -290,6 +290,20 @@ def test_a_rollout_that_ends_early_has_no_errors(runs):
     assert "factor of ten" in values["runs"][0]["models"]["bad"]["message"]
 
 
+def test_a_validation_prints_in_a_few_lines(perfect, model, runs):
+    head, *lines = repr(perfect).split("\n")
+    assert head == "<Validation on 1 run, 3 channels"
+    for line, name in zip(lines, ("linear-fit", "multi-fidelity"), strict=True):
+        assert line.startswith(f"  {name}: 1 of 1 rollouts completed, mean NRMSE 0.00 (")
+    assert repr(perfect).endswith(")>")
+    unstable = linear_model(OSCILLATOR_A + 5 * np.eye(2), OSCILLATOR_B, names=["q", "v"], span=1e-2)
+    signals = replace(model.signals, outputs=())
+    unstable = replace(unstable, signals=signals)
+    assert repr(validate({"bad": unstable}, runs[2:])) == (
+        "<Validation on 2 runs, 2 channels\n  bad: 0 of 2 rollouts completed>"
+    )
+
+
 def test_to_dict_survives_json(perfect):
     values = json.loads(json.dumps(perfect.to_dict(), allow_nan=False))
     assert values["runs"][0]["models"]["multi-fidelity"]["errors"]["q"]["nrmse"] == (
@@ -314,10 +328,12 @@ def test_a_recorded_channel_that_does_not_vary_has_no_nrmse(model, runs, level):
 def test_confounded_inputs_do_not_spoil_the_json(runs):
     same = [replace(r, values=r.values[:, [0, 1, 2, 3, 4, 3]], channels=(
         *r.channels, Channel("copy", "m/s"))) for r in runs]  # fmt: skip
-    constant = replace(CHOICES, parameters=("copy",))
-    for run in (same, [replace(r, values=np.column_stack([r.values[:, :5], 0 * r.time + 2]))
-                       for r in same]):  # fmt: skip
-        model = fit(run[:3], constant).model
+    constant = [replace(r, values=np.column_stack([r.values[:, :5], 0 * r.time + 2])) for r in same]
+    for run, inputs in (
+        (same, {"disturbances": ("w", "copy")}),
+        (constant, {"parameters": ("copy",)}),
+    ):
+        model = fit(run[:3], replace(CHOICES, **inputs)).model
         json.dumps(validate({"m": model}, run[3:]).to_dict(), allow_nan=False)
 
 
@@ -330,6 +346,9 @@ def test_an_irregular_mesh(model):
     figures = found.runs[0].statistics["q"]
     np.testing.assert_allclose(figures.std, run["q"].std(), rtol=0.05)
     assert np.isfinite(figures.spectrum.density).all()
+    step = float(np.median(np.diff(run.time)))
+    values = np.interp(np.arange(mesh[0], mesh[-1], step), run.time, run["q"])
+    assert (figures.std, figures.maximum) == (values.std(), values.max())
 
 
 def test_blade_passing_gets_a_band():

@@ -88,7 +88,10 @@ def fit(
     with _working(quiet):
         settings, runs = load_config(config)
         result = run_fit(runs, settings.fit_settings())
+    replaced = output.exists() and any(output.iterdir())
     save(result.model, output, result.nonlinear)
+    if replaced and not quiet:
+        print(printable(f"note: replaced the model that was in {output}"), file=sys.stderr)
     if as_json:
         from dfsm.files import json_value
 

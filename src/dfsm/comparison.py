@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.errors import printable
 from dfsm.files import json_value
 from dfsm.model import DFSM
 from dfsm.simulate import MUCH_OUTSIDE, Simulation, Status
@@ -137,6 +138,19 @@ class Validation:
     eigenvalues: Sequence[tuple[float, ComplexArray]]
     record: Mapping[str, Any]
     warnings: tuple[str, ...] = field(default=())
+
+    def __repr__(self) -> str:
+        runs = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
+        lines = [f"<Validation on {runs}, {len(self.channels)} channels"]
+        for model in self.models:
+            line = f"  {model}: {self.completed(model)} of {len(self.runs)} rollouts completed"
+            means = {c.name: self.mean_nrmse(model, c.name) for c in self.channels}
+            found = [(v, name) for name, v in means.items() if v is not None]
+            if found:
+                (low, best), (high, worst) = min(found), max(found)
+                line += f", mean NRMSE {low:.2f} ({best}) to {high:.2f} ({worst})"
+            lines.append(printable(line))
+        return "\n".join(lines) + ">"
 
     def mean_nrmse(self, model: str, channel: str) -> float | None:
         """Mean NRMSE over the test runs; None if the model did not complete all of them."""

@@ -61,7 +61,7 @@ class Config(_Strict):
     linear: Annotated[LTI | LPV, Field(discriminator="kind")] = LTI()
     corrective: Annotated[
         RBF | IncrementalRBF | GP | MLP | NoCorrection, Field(discriminator="kind")
-    ] = RBF()
+    ] = MLP()
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
@@ -112,6 +112,10 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
 
 def parse_config(path: Path) -> Config:
     """Read and check a configuration without touching the data."""
+    if path.is_dir():
+        inside = [*path.glob("config.yaml")] or [*path.glob("*.yaml"), *path.glob("*.yml")]
+        hint = f"did you mean {inside[0]}?" if len(inside) == 1 else "name one, or use dfsm init"
+        raise DfsmError(f"{path} is a folder, a configuration file was expected: {hint}")
     try:
         raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except OSError as error:

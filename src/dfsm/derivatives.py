@@ -72,6 +72,11 @@ class StateSpec:
                 f"'{self.acceleration}': set order to 2 or leave the channel out"
             )
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Recorded channels that the state and its derivatives are taken from."""
+        return tuple(n for n in (self.name, self.rate, self.acceleration) if n is not None)
+
 
 @settings
 class DerivativeSettings:
@@ -241,8 +246,7 @@ class _State:
 
 
 def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeSettings) -> _State:
-    used = [n for n in (spec.name, spec.rate, spec.acceleration) if n is not None]
-    run.select(used).require_finite()
+    run.select(spec.channels).require_finite()
     chosen = settings.filters.get(spec.name)
     state = _estimate(run, spec.name, chosen, settings)
     if spec.rate is not None:
@@ -289,10 +293,8 @@ def _estimate(
 def _check_names(
     run: Trajectory, states: Sequence[StateSpec], settings: DerivativeSettings
 ) -> None:
+    run.columns(n for spec in states for n in spec.channels)
     for spec in states:
-        for name in (spec.name, spec.rate, spec.acceleration):
-            if name is not None:
-                run.column(name)
         if spec.order == 2 and f"{spec.name}_dot" in run:
             raise DfsmError(
                 f"{run.where}: there is a channel '{spec.name}_dot' already, the name that the "

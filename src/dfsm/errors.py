@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+# Share of letters in common from which two names are alike.
+_ALIKE = 0.6
 
 
 class DfsmError(Exception):
@@ -38,9 +41,51 @@ def near_matches(name: str, known: Iterable[str]) -> str:
         ``"did you mean 'PtfmPitch'?"`` or, where nothing is close, the first known names.
     """
     known = list(known)
-    folded = {k.casefold(): k for k in known}
-    close = difflib.get_close_matches(name.casefold(), list(folded), n=3, cutoff=0.6)
-    if close:
-        return "did you mean " + " or ".join(f"'{folded[c]}'" for c in close) + "?"
+    return _question(_close(name, known)) or _listed(known)
+
+
+def missing(names: Sequence[str], known: Iterable[str]) -> str:
+    """Say which channels are not among the known ones, each with what it may stand for.
+
+    Parameters
+    ----------
+    names
+        What was looked for in vain, at least one.
+    known
+        The channels that exist.
+
+    Returns
+    -------
+    str
+        ``"no channel 'GenSped'; did you mean 'GenSpeed'?"``, or all of several names at once.
+    """
+    known = list(known)
+    if len(names) == 1:
+        return f"no channel '{names[0]}'; {near_matches(names[0], known)}"
+    asked = {n: _question(_close(n, known)) for n in names}
+    told = ", ".join(f"'{n}'" + (f" ({q})" if q else "") for n, q in asked.items())
+    return f"no channels {told}" + ("" if all(asked.values()) else f"; {_listed(known)}")
+
+
+def _close(name: str, known: Sequence[str]) -> list[str]:
+    """Known names that resemble or contain `name`, or stand in it, best first; case is ignored."""
+    wanted, found = name.casefold(), list[tuple[float, str]]()
+    for candidate in known:
+        folded = candidate.casefold()
+        if folded == wanted:
+            return [candidate]
+        likeness = difflib.SequenceMatcher(None, folded, wanted).ratio()
+        # One letter stands in almost any name.
+        part = min(len(folded), len(wanted)) > 1 and (wanted in folded or folded in wanted)
+        if part or likeness >= _ALIKE:
+            found.append((likeness, candidate))
+    return [candidate for _, candidate in sorted(found, key=lambda f: -f[0])[:3]]
+
+
+def _question(close: Sequence[str]) -> str:
+    return "did you mean " + " or ".join(f"'{c}'" for c in close) + "?" if close else ""
+
+
+def _listed(known: Sequence[str]) -> str:
     shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
     return f"known are: {shown}" if known else "none are known"

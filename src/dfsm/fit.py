@@ -25,8 +25,7 @@ from dfsm.derivatives import kinematic_rows
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
 from dfsm.model import DFSM
-from dfsm.read.wind import wind_warning
-from dfsm.samples import FitSettings, Samples, extract, select
+from dfsm.samples import FitSettings, Samples, data_warnings, extract, select
 from dfsm.signals import Provenance, Region
 from dfsm.simulate import Status, simulate
 from dfsm.stability import stabilise
@@ -61,6 +60,10 @@ class FitResult:
     nonlinear: DFSM | None
     seconds: Mapping[str, float]
 
+    def __repr__(self) -> str:
+        extra = "" if self.nonlinear is None else ", and a nonlinear-only model"
+        return f"<FitResult after {sum(self.seconds.values()):.1f} s: {self.model!r}{extra}>"
+
 
 # Threads gain next to nothing on matrices this narrow, and where other programs use the machine
 # they wait for each other: measured five times slower on two loaded cores.
@@ -88,7 +91,7 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
     -----
     DfsmWarning
         Inputs that the data cannot tell apart, an unstable linear fit, a disturbance that holds
-        a response.
+        a response, a gap in a record, a parameter with one value in all runs.
     """
     seconds: dict[str, float] = {}
     with _timed(seconds, "select"):
@@ -113,7 +116,7 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
     )
     with _timed(seconds, "checks"):
         notes, checks = _check(model, samples, data, choices)
-    notes = [*f.warnings, *(g.warnings if g else ()), *notes]
+    notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
     checks = [*f.notes, *checks]
     nonlinear = None
     if choices.nonlinear_only and not isinstance(choices.corrective, NoCorrection):
@@ -247,10 +250,11 @@ def _correct(
                 f"{explained[i]:.1%} is explained in cross-validation ({detail})"
             )
         elif i in explained:
-            text = (
-                f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains only "
-                f"{max(explained[i], 0.0):.1%} of its variance in cross-validation"
-            )
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains "
+            if explained[i] < 0.001:  # negative where it would do harm
+                text += "nothing on data left out of its training"
+            else:
+                text += f"only {explained[i]:.1%} of its variance in cross-validation"
         else:
             text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
         decisions.append(
@@ -340,7 +344,7 @@ def _check(
     model: DFSM, samples: Samples, data: Dataset, choices: FitSettings
 ) -> tuple[list[str], list[str]]:
     """Look for what would surprise a user: non-finite values, instability, leaking disturbances."""
-    notes = [text for name in choices.disturbances if (text := wind_warning(name))]
+    notes = data_warnings(data, choices)
     x, u, w, p = model.split(samples.inputs)
     values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
     if not np.isfinite(values).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,17 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from dfsm.errors import DfsmError
 from dfsm.model import DFSM
 from dfsm.trajectory import Trajectory
-from dfsm.types import Array, IntArray
+from dfsm.types import Array
 
 # Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 1000
 _MAX_STEPS = 1_000_000
-# Steps per turn of the compiled loop: fewer turns, a little more to compile.
-_UNROLL = 4
-# Below this a second thread costs more than it gains.
-_RUNS_PER_WORKER = 4
+# Fixed steps of one run, whose inputs and states are all held in memory.
+_MOST_STEPS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -49,19 +48,43 @@ class Mesh:
         """Number of steps."""
         return len(self.time) // 2
 
-    @property
-    def samples(self) -> slice:
-        """Where the run's own samples stand."""
-        return slice(0, len(self.time), 2 * self.every)
+
+@dataclass(frozen=True)
+class Case:
+    """Where a rollout starts and what drives it.
+
+    Attributes
+    ----------
+    mesh
+        Times and inputs.
+    x0
+        Initial states ``(state,)``.
+    psi0
+        Initial azimuth in rad.
+    """
+
+    mesh: Mesh
+    x0: Array
+    psi0: float
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """States, outputs and inputs at the run's samples ``(sample, n)``; whether it was solved."""
+    """What a rollout gives at the run's samples.
+
+    Attributes
+    ----------
+    states, outputs
+        Shapes ``(sample, state)`` and ``(sample, output)``.
+    outside
+        Whether any input is outside its training range, ``(sample,)``.
+    solved
+        Whether the solver reached the end.
+    """
 
     states: Array
     outputs: Array
-    inputs: Array
+    outside: Array
     solved: bool
 
 
@@ -76,9 +99,23 @@ def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
         Largest step in s; None makes one step per sample.
     interpolation
         ``"linear"`` or ``"cubic"`` spline.
+
+    Raises
+    ------
+    DfsmError
+        So small a step that the inputs along it would fill the memory.
     """
-    longest = float(np.diff(driven.time).max())
-    every = 1 if step is None else max(1, int(np.ceil(longest / step * (1 - 1e-9))))
+    longest, intervals = float(np.diff(driven.time).max()), len(driven) - 1
+    parts = 1.0 if step is None else longest / step * (1 - 1e-9)
+    if parts > 1 and parts * intervals > _MOST_STEPS:
+        # A little more than the smallest, so that the rounded figure is allowed too.
+        least = 1.01 * longest / max(1, _MOST_STEPS // intervals)
+        raise DfsmError(
+            f"{driven.where}: steps of {step:g} s over {driven.duration:g} s make "
+            f"{parts * intervals:.3g} steps, at most {_MOST_STEPS:,} are allowed: choose a step "
+            f"of at least {least:.3g} s, or a shorter time window"
+        )
+    every = max(1, int(np.ceil(parts)))
     parts = np.arange(2 * every) / (2 * every)
     time = _between(driven.time[:, None], parts)[:, 0]
     if interpolation == "cubic":
@@ -99,57 +136,53 @@ def _between(values: Array, parts: Array) -> Array:
 # -- fixed steps --------------------------------------------------------------------------------
 
 
-def march(model: DFSM, meshes: Sequence[Mesh], x0: Array, psi0: Array) -> list[Rollout]:
-    """Classical RK4 over all runs at once.
+def march(model: DFSM, cases: Iterable[Case]) -> Iterator[Rollout]:
+    """Classical RK4, one thread per processor; an accelerator takes all runs in one batch.
+
+    On a processor XLA keeps a loop on one core, and a single run stays in its cache where a batch
+    does not. Runs are marched while the next are being prepared.
 
     Parameters
     ----------
     model
         The surrogate.
-    meshes
-        One per run; lengths may differ.
-    x0, psi0
-        Initial states ``(run, state)`` and azimuths in rad ``(run,)``.
+    cases
+        One per run, consumed in order; lengths may differ.
+
+    Yields
+    ------
+    Rollout
+        In the order of `cases`.
     """
-    padded = -(-max(m.steps for m in meshes) // _PAD) * _PAD
-    h = np.zeros((len(meshes), padded))
-    inputs = np.zeros((len(meshes), 2 * padded + 1, meshes[0].inputs.shape[1]))
-    for i, m in enumerate(meshes):
+    if jax.default_backend() != "cpu":
+        yield from _march_batch(model, list(cases))
+        return
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for rollouts in pool.map(lambda case: _march_batch(model, [case]), cases):
+            yield from rollouts
+
+
+def _march_batch(model: DFSM, cases: Sequence[Case]) -> list[Rollout]:
+    padded = -(-max(c.mesh.steps for c in cases) // _PAD) * _PAD
+    h = np.zeros((len(cases), padded))
+    inputs = np.zeros((len(cases), 2 * padded + 1, cases[0].mesh.inputs.shape[1]))
+    for i, m in enumerate(c.mesh for c in cases):
         h[i, : m.steps] = np.diff(m.time[::2])
         inputs[i, : len(m.time)] = m.inputs
         inputs[i, len(m.time) :] = m.inputs[-1]
-    states, outputs = _march_parts(model, x0, psi0, h, inputs)
+    x0, psi0 = np.stack([c.x0 for c in cases]), np.array([c.psi0 for c in cases])
+    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, inputs))
     rollouts = []
-    for i, m in enumerate(meshes):
+    for i, m in enumerate(c.mesh for c in cases):
         rows = slice(0, m.steps + 1, m.every)
-        rollouts.append(Rollout(states[i, rows], outputs[i, rows], m.inputs[m.samples], True))
+        rollouts.append(Rollout(states[i, rows], outputs[i, rows], outside[i, rows], True))
     return rollouts
-
-
-def _march_parts(
-    model: DFSM, x0: Array, psi0: Array, h: Array, inputs: Array
-) -> tuple[Array, Array]:
-    """Give each processor an equal part of the batch; XLA runs small steps on one only."""
-    runs = len(x0)
-    workers = min(os.cpu_count() or 1, runs // _RUNS_PER_WORKER) or 1
-    size = -(-runs // workers)
-    parts = [np.arange(i, i + size) % runs for i in range(0, runs, size)]
-
-    def one(part: IntArray) -> tuple[Array, Array]:
-        states, outputs = _march(model, x0[part], psi0[part], h[part], inputs[part])
-        return np.asarray(states), np.asarray(outputs)
-
-    if workers == 1:
-        return one(parts[0])
-    with ThreadPoolExecutor(workers) as pool:
-        states, outputs = zip(*pool.map(one, parts), strict=True)
-    return np.concatenate(states)[:runs], np.concatenate(outputs)[:runs]
 
 
 @eqx.filter_jit
 def _march(
     model: DFSM, x0: Array, psi0: Array, h: Array, inputs: Array
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     model = model.prepared()
 
     def step(x: jax.Array, drive: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
@@ -162,11 +195,12 @@ def _march(
         return x, x
 
     def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
-        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]), unroll=_UNROLL)
+        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
         return jnp.concatenate([x0[None], xs])
 
     xs = jax.vmap(states)(*map(jnp.asarray, (x0, h, inputs)))
-    return xs, _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
+    seen = _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
+    return xs, *seen
 
 
 def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -179,52 +213,54 @@ def _slope(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
     return model.derivative(x, *exogenous_groups(model, v))
 
 
-def _observe(model: DFSM, h: jax.Array, xs: jax.Array, v: jax.Array, psi0: jax.Array) -> jax.Array:
-    """Outputs along rollouts ``(..., time, n)``; the azimuth is the integral of their own speed."""
+def _observe(
+    model: DFSM, h: jax.Array, xs: jax.Array, v: jax.Array, psi0: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Outputs along rollouts ``(..., time, n)`` and whether any input is outside its range.
+
+    The azimuth is the integral of the rollout's own speed.
+    """
     turn, psi = model.signals.azimuth_rate, None
     if turn is not None:
         omega = turn[1] * xs[..., turn[0]]
         angle = jnp.cumsum(0.5 * h * (omega[..., 1:] + omega[..., :-1]), axis=-1)
         psi = psi0[..., None] + jnp.concatenate([jnp.zeros_like(omega[..., :1]), angle], axis=-1)
-    return model.output(xs, *exogenous_groups(model, v), psi)
+    groups = exogenous_groups(model, v)
+    return model.output(xs, *groups, psi), model.region.outside(model.join(xs, *groups))
 
 
 # -- adaptive steps -----------------------------------------------------------------------------
 
 
-def adapt(
-    model: DFSM, mesh: Mesh, x0: Array, psi0: float, method: str, tolerances: tuple[float, float]
-) -> Rollout:
+def adapt(model: DFSM, case: Case, method: str, tolerances: tuple[float, float]) -> Rollout:
     """Integrate one run with diffrax.
 
     Parameters
     ----------
     model
         The surrogate.
-    mesh
-        From `mesh_of`; the inputs vary linearly between its points.
-    x0, psi0
-        Initial states ``(state,)`` and azimuth in rad.
+    case
+        The inputs vary linearly between the points of its mesh.
     method
         ``"tsit5"`` or ``"kvaerno5"`` (stiff).
     tolerances
         Relative, and absolute in standard deviations of each state.
     """
-    rows = mesh.samples
+    mesh = case.mesh
     # Tolerances as arrays: a Python number would be compiled in, and another compile again.
     rtol, atol = map(jnp.asarray, tolerances)
-    states, outputs, solved = _adapt(
+    states, outputs, outside, solved = _adapt(
         model,
         mesh.time,
         mesh.inputs,
-        jnp.asarray(x0),
-        jnp.asarray(psi0),
+        jnp.asarray(case.x0),
+        jnp.asarray(case.psi0),
         rtol,
         atol,
         method=method,
         every=mesh.every,
     )
-    return Rollout(np.asarray(states), np.asarray(outputs), mesh.inputs[rows], bool(solved))
+    return Rollout(np.asarray(states), np.asarray(outputs), np.asarray(outside), bool(solved))
 
 
 @eqx.filter_jit
@@ -239,7 +275,7 @@ def _adapt(
     *,
     method: str,
     every: int,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     import diffrax
 
     path = diffrax.LinearInterpolation(jnp.asarray(time), jnp.asarray(inputs))
@@ -263,5 +299,5 @@ def _adapt(
     )
     states = jnp.asarray(solution.ys) * spread
     v = jnp.asarray(inputs[:: 2 * every])
-    outputs = _observe(model, jnp.diff(samples), states, v, psi0)
-    return states, outputs, solution.result == diffrax.RESULTS.successful
+    outputs, outside = _observe(model, jnp.diff(samples), states, v, psi0)
+    return states, outputs, outside, solution.result == diffrax.RESULTS.successful

@@ -84,8 +84,11 @@ class NormalEquations:
         m = self.n_inputs
         scale = np.sqrt(np.maximum(np.diag(products)[:m], 0.0))
         # A column that does not vary gets no coefficient; any scale but zero will do.
-        scale[scale <= 1e-12 * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)] = np.inf
+        still = scale <= 1e-12 * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)
+        scale[still] = np.inf
         Q = products[:m, :m] / np.outer(scale, scale)
+        # It is confounded with nothing, so it has no part in the condition number.
+        Q[still, still] = 1.0
         eigenvalues, V = np.linalg.eigh(Q)
         floor = eigenvalues[-1] * max(1e-13, 10 * m * np.finfo(float).eps)
         used = eigenvalues > floor
@@ -99,7 +102,7 @@ class NormalEquations:
             offset=mean[m:] - L @ mean[:m],
             residual_variance=np.maximum(rss, 0.0),
             target_variance=np.maximum(np.diag(products)[m:], 0.0),
-            input_variance=np.maximum(np.diag(products)[:m], 0.0),
+            input_variance=np.where(still, 0.0, np.maximum(np.diag(products)[:m], 0.0)),
             eigenvalues=np.maximum(eigenvalues, 0.0),
             directions=V,
         )

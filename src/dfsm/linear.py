@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import dfsm.precision  # noqa: F401
+import dfsm.jax_setup  # noqa: F401
 from dfsm.errors import DfsmError
 from dfsm.least_squares import BLOCK, NormalEquations, Solution, merge
 from dfsm.settings import settings
@@ -134,7 +134,7 @@ class LinearFit:
     equations
         The sums behind every schedule point.
     warnings
-        Sentences that name inputs which the data cannot tell apart.
+        Sentences that name inputs which do not vary or which the data cannot tell apart.
     notes
         What was done to the fit afterwards, and what it cost.
     """
@@ -279,11 +279,18 @@ def _check_counts(sums: Sequence[NormalEquations], windows: Array, choice: LTI |
 
 
 def _warnings(solution: Solution, names: Sequence[str]) -> tuple[str, ...]:
+    constant = tuple(
+        f"input '{name}' has the same value in all samples, so nothing can be learned about its "
+        "effect: leave it out, or add runs with other values"
+        for name, variance in zip(names, solution.input_variance, strict=True)
+        if variance == 0
+    )
     if solution.condition <= CONDITION_LIMIT:
-        return ()
+        return constant
     which = ", ".join(solution.confounded(list(names)))
     figure = f"{solution.condition:.1e}" if np.isfinite(solution.condition) else "infinite"
     return (
+        *constant,
         f"the runs cannot tell these inputs apart: {which} (condition number {figure}); "
         "predictions hold where the inputs stay related as in the training runs, "
         "the separate coefficients mean little",

@@ -19,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-import dfsm.precision  # noqa: F401
+import dfsm.jax_setup  # noqa: F401
 from dfsm.corrective.functions import Corrective
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, printable
 from dfsm.linear import LinearModel
 from dfsm.signals import Provenance, Region, SignalTable, blade_harmonics
+from dfsm.trajectory import labels
 from dfsm.types import Array, ComplexArray
 
 if TYPE_CHECKING:
@@ -62,6 +63,16 @@ class DFSM(eqx.Module):
     corrected_outputs: tuple[int, ...] = eqx.field(static=True)
     signals: SignalTable = eqx.field(static=True)
     provenance: Provenance = eqx.field(static=True, default_factory=Provenance)
+
+    def __repr__(self) -> str:
+        # Without the arrays, which JAX replaces by other things at times.
+        groups = ("states", "controls", "disturbances", "parameters", "outputs")
+        told = [f"{g} {labels(c)}" for g in groups if (c := getattr(self.signals, g))]
+        kind = "LTI" if self.f.schedule is None else f"LPV in {printable(self.schedule or '')}"
+        rows = f"{len(self.corrected)} of {len(self.signals.states)} derivatives"
+        if outputs := len(self.signals.outputs):
+            rows += f" and {len(self.corrected_outputs)} of {outputs} outputs"
+        return f"<DFSM: {kind}, {rows} corrected; {'; '.join(told)}>"
 
     # -- evaluation -----------------------------------------------------------------------------
 

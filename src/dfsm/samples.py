@@ -8,17 +8,25 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from dfsm.corrective import RBF, CorrectiveChoice
-from dfsm.derivatives import DerivativeSettings, StateSpec, differentiate, state_names
+from dfsm.corrective import MLP, CorrectiveChoice
+from dfsm.derivatives import (
+    DerivativeSettings,
+    StateSpec,
+    differentiate,
+    state_names,
+    state_units,
+)
 from dfsm.errors import DfsmError
 from dfsm.linear import LPV, LTI
 from dfsm.progress import track
+from dfsm.read import gap_warning, wind_warning
 from dfsm.settings import require, settings
 from dfsm.signals import (
     Azimuth,
     SignalTable,
     blade_harmonics,
     radians_per_second,
+    require_constant,
     with_corrected_wind,
 )
 from dfsm.trajectory import Channel, Dataset, Role, Trajectory
@@ -67,7 +75,7 @@ class FitSettings:
     stop: float | None = None
     derivatives: DerivativeSettings = field(default_factory=DerivativeSettings)
     linear: LTI | LPV = field(default_factory=LTI)
-    corrective: CorrectiveChoice = field(default_factory=RBF)
+    corrective: CorrectiveChoice = field(default_factory=MLP)
     gate: float = 0.01
     azimuth: Azimuth | None = None
     hub_height: float | None = None
@@ -89,7 +97,7 @@ class FitSettings:
         """
         roles: dict[str, Role] = {}
         groups: tuple[tuple[Role, Iterable[str]], ...] = (
-            ("state", [n for s in self.states for n in (s.name, s.rate, s.acceleration) if n]),
+            ("state", [n for s in self.states for n in s.channels]),
             ("control", self.controls),
             ("disturbance", self.disturbances),
             ("parameter", self.parameters),
@@ -163,7 +171,23 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
                 f"can be learned about its effect: leave it out of {roles[name]}s, or add runs "
                 "in which it varies"
             )
+    for run in data:
+        require_constant(run.window(choices.start, choices.stop), choices.parameters)
     return data
+
+
+def data_warnings(data: Dataset, choices: FitSettings) -> list[str]:
+    """What a user should know about the data before trusting a fit, one sentence each."""
+    found = [text for name in choices.disturbances if (text := wind_warning(name))]
+    gaps = [
+        f"{run.where}: {text}"
+        for run in data
+        if (text := gap_warning(run.window(choices.start, choices.stop)))
+    ]
+    if gaps:
+        more = f" ({len(gaps)} of the {len(data)} runs have gaps)" if len(gaps) > 1 else ""
+        found.append(gaps[0] + more)
+    return found
 
 
 def extract(data: Dataset, choices: FitSettings) -> Samples:
@@ -200,13 +224,16 @@ def extract(data: Dataset, choices: FitSettings) -> Samples:
 
 def _signals(data: Dataset, choices: FitSettings) -> SignalTable:
     # The first run stands for all: `select` has made sure that units agree.
-    found = differentiate(data[0], choices.states, choices.derivatives).trajectory
+    first, names = data[0], state_names(choices.states)
 
     def channels(names: Iterable[str], role: Role) -> tuple[Channel, ...]:
-        return tuple(Channel(n, found.channel(n).unit, role=role) for n in names)
+        return tuple(Channel(n, first.channel(n).unit, role=role) for n in names)
 
     table = SignalTable(
-        states=channels(state_names(choices.states), "state"),
+        states=tuple(
+            Channel(n, unit, role="state")
+            for n, unit in zip(names, state_units(choices.states, first), strict=True)
+        ),
         controls=channels(choices.controls, "control"),
         disturbances=channels(choices.disturbances, "disturbance"),
         parameters=channels(choices.parameters, "parameter"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-import dfsm.precision  # noqa: F401
+import dfsm.jax_setup  # noqa: F401
 from dfsm.derivatives import DerivativeSettings, StateSpec
 from dfsm.errors import DfsmError, near_matches
 from dfsm.read.wind import CORRECTED_WIND, undisturbed_rotor_wind
@@ -89,6 +89,17 @@ class SignalTable:
         """Names of what drives a simulation: controls, disturbances, parameters."""
         return tuple(c.name for c in (*self.controls, *self.disturbances, *self.parameters))
 
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the channels that an initial state is taken from."""
+        return tuple(n for s in self.specs for n in (s.name, s.rate) if n is not None)
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Names of the channels that a run holds which the model can be compared with."""
+        states = [n for s in self.specs for n in s.channels]
+        return (*self.exogenous, *states, *self.names("outputs"))
+
     def names(self, group: str) -> tuple[str, ...]:
         """Names of one group, e.g. ``names("states")``."""
         return tuple(c.name for c in getattr(self, group))
@@ -113,6 +124,25 @@ def with_corrected_wind(run: Trajectory, hub_height: float | None) -> Trajectory
     if hub_height is None or CORRECTED_WIND in run:
         return run
     return undisturbed_rotor_wind(run, hub_height)
+
+
+def require_constant(run: Trajectory, parameters: Iterable[str]) -> None:
+    """Refuse a run in which a parameter varies by more than it is rounded.
+
+    Raises
+    ------
+    DfsmError
+        Names the run, the first such parameter and its range.
+    """
+    for name in parameters:
+        values, channel = run[name], run.channel(name)
+        low, high = float(values.min()), float(values.max())
+        if high - low > (channel.step or 0.0) + 1e-9 * max(abs(low), abs(high)):
+            unit = f" {channel.unit}" if channel.unit else ""
+            raise DfsmError(
+                f"{run.where}: parameter '{name}' goes from {low:g} to {high:g}{unit}, but "
+                "parameters are constant within a run: give it as a disturbance or control"
+            )
 
 
 def radians_per_second(speed: Channel) -> float:

@@ -12,18 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args, overload
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dfsm.derivatives import differentiate
-from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.integrate import Rollout, adapt, exogenous_groups, march, mesh_of
+from dfsm.errors import DfsmError, DfsmWarning, printable
+from dfsm.integrate import Case, Rollout, adapt, march, mesh_of
 from dfsm.model import DFSM
 from dfsm.settings import settings
-from dfsm.signals import with_corrected_wind
+from dfsm.signals import require_constant, with_corrected_wind
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 
@@ -31,10 +28,12 @@ from dfsm.types import Array
 _ESCAPE = 10.0
 # Share of the time outside the training range above which a user is warned.
 MUCH_OUTSIDE = 0.05
-# Rates at the start are taken from this many seconds of the record before it (or, where the
-# record starts there, just after it): long enough for a derivative, too short to leak a response.
-_HISTORY = 20.0
+# Rates at the start are taken from this much of the record before it (or, where the record starts
+# there, just after it): long enough for a derivative, too short to leak a response.
+_HISTORY = 5.0
+_HISTORY_SAMPLES = 100
 _HEAD = 1.0
+_HEAD_SAMPLES = 20
 
 
 Method = Literal["rk4", "tsit5", "kvaerno5"]
@@ -111,7 +110,14 @@ class Simulation:
     ended: float
     reason: str
     outside: float
-    wall_time: float
+    wall_time: float = 0.0
+
+    def __repr__(self) -> str:
+        run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
+        return (
+            f"<Simulation of {printable(run.name)}: {outcome}, {run.time[0]:g} to "
+            f"{self.ended:g} s, {len(run)} samples; {printable(self.message)}>"
+        )
 
     @property
     def message(self) -> str:
@@ -176,7 +182,8 @@ def simulate(
     Raises
     ------
     DfsmError
-        A channel is missing or not finite, or the window is too short.
+        A channel is missing or not finite, a parameter varies within a run, the window is too
+        short, or the step too small for it.
 
     Warns
     -----
@@ -190,31 +197,36 @@ def simulate(
     if not batch:
         raise DfsmError("no runs were given to simulate")
     names = model.signals.exogenous
+    for run in batch:
+        run.columns((*names, *(model.signals.measured if initial is None else ())))
     driven = [r.select(names).window(start, stop).require_finite() for r in batch]
-    starts = [float(d.time[0]) for d in driven]
-    if initial is None:
-        x0 = np.stack([initial_state(model, r, t) for r, t in zip(batch, starts, strict=True)])
-    else:
-        x0, shape = np.asarray(initial, dtype=np.float64), (len(batch), len(model.signals.states))
-        if x0.shape not in (shape, shape[1:]):
-            raise DfsmError(f"initial has shape {x0.shape}, expected {shape[1:]} or {shape}")
-        x0 = np.broadcast_to(x0, shape)
-    psi0 = np.array([_initial_azimuth(model, r, t) for r, t in zip(batch, starts, strict=True)])
+    for run in driven:
+        require_constant(run, model.signals.names("parameters"))
+    shape = (len(batch), len(model.signals.states))
+    given = None if initial is None else np.asarray(initial, dtype=np.float64)
+    if given is not None:
+        if given.shape not in (shape, shape[1:]):
+            raise DfsmError(f"initial has shape {given.shape}, expected {shape[1:]} or {shape}")
+        given = np.broadcast_to(given, shape)
+
+    def case(i: int) -> Case:
+        begins = float(driven[i].time[0])
+        x0 = initial_state(model, batch[i], begins) if given is None else given[i]
+        mesh = mesh_of(driven[i], options.step, options.interpolation)
+        return Case(mesh, x0, _initial_azimuth(model, batch[i], begins))
+
     begin = clock.perf_counter()
-    meshes = [mesh_of(d, options.step, options.interpolation) for d in driven]
+    cases = map(case, range(len(batch)))
     if options.method == "rk4":
-        solved = march(model, meshes, x0, psi0)
+        solved = march(model, cases)
     else:
         tolerances = (options.rtol, options.atol)
-        solved = [
-            adapt(model, m, x, psi, options.method, tolerances)
-            for m, x, psi in zip(meshes, x0, psi0, strict=True)
-        ]
-    wall = (clock.perf_counter() - begin) / len(batch)
+        solved = (adapt(model, c, options.method, tolerances) for c in cases)
     results = [
-        _result(model, r, d, rollout, wall)
-        for r, d, rollout in zip(batch, driven, solved, strict=True)
+        _result(model, r, d, rollout) for r, d, rollout in zip(batch, driven, solved, strict=True)
     ]
+    wall = (clock.perf_counter() - begin) / len(batch)
+    results = [replace(r, wall_time=wall) for r in results]
     _warn(results)
     return results[0] if single else results
 
@@ -240,7 +252,6 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     measured = [n for spec in s.specs for n in (spec.name, spec.rate) if n is not None]
     specs = [replace(spec, acceleration=None) for spec in s.specs]
     run = run.select(dict.fromkeys(measured))
-    before = (run.time <= start) & (run.time >= start - _HISTORY)
     if all(spec.order == 1 or spec.rate for spec in specs):
         index = int(np.argmin(np.abs(run.time - start)))
         # Two samples make a trajectory, whose check says which channel is not finite and when.
@@ -249,10 +260,12 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
         values = dict(zip(run.names, run.values[index], strict=True))
         rates = [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
         return np.array([values[spec.name] for spec in specs] + rates)
-    if before.sum() >= 20:
-        piece, row = run.window(start - _HISTORY, start), -1
+    now = int(np.searchsorted(run.time, start, side="right"))
+    if now >= _HEAD_SAMPLES:
+        first = min(start - _HISTORY, float(run.time[max(0, now - _HISTORY_SAMPLES)]))
+        piece, row = run.window(first, start), -1
     else:
-        head = max(start + _HEAD, float(run.time[min(len(run) - 1, 19)]))
+        head = max(start + _HEAD, float(run.time[min(len(run), _HEAD_SAMPLES) - 1]))
         piece, row = run.window(start, head), 0
     found = differentiate(piece.require_finite(), specs, s.derivatives)
     return found.trajectory.select(found.names).values[row]
@@ -268,9 +281,7 @@ def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
 # -- judging the outcome ------------------------------------------------------------------------
 
 
-def _result(
-    model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout, wall: float
-) -> Simulation:
+def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) -> Simulation:
     s = model.signals
     n_uw = len(s.controls) + len(s.disturbances)
     columns = slice(n_uw, n_uw + len(s.states))
@@ -298,21 +309,13 @@ def _result(
     values[end:] = np.nan  # a trajectory has two samples, even if the first step failed
     channels = (*s.states, *s.outputs)
     time = driven.time[: len(values)]
-    outside = np.asarray(_outside(model, x, rollout.inputs))[:end]
     return Simulation(
         trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
         status=status,
         ended=float(time[end - 1]),
         reason=reason,
-        outside=float(outside.mean()),
-        wall_time=wall,
+        outside=float(rollout.outside[:end].mean()),
     )
-
-
-@eqx.filter_jit
-def _outside(model: DFSM, states: Array, exogenous: Array) -> jax.Array:
-    u, w, p = exogenous_groups(model, jnp.asarray(exogenous))
-    return model.region.outside(model.join(states, u, w, p))
 
 
 def _warn(results: Sequence[Simulation]) -> None:

@@ -272,6 +272,7 @@ class _Level:
         self.knots = np.concatenate([first, sites[3:-3], last])
         self.size = len(sites)
         self.basis = BSpline.design_matrix(x, self.knots, _DEGREE)
+        self.transposed = self.basis.T.tocsr()
         rows = np.asarray(self.basis.data, dtype=np.float64).reshape(-1, _WIDTH)
         start = np.asarray(self.basis.indices, dtype=np.int64).reshape(-1, _WIDTH)[:, 0]
         self.gram = _banded_gram(rows, start, self.size)
@@ -285,7 +286,7 @@ class _Level:
     def fit(self, z: Array, lam: float) -> tuple[Array, Array]:
         """Coefficients and residual for one λ."""
         factor = (self._factor(lam), False)
-        c = cho_solve_banded(factor, self.basis.T @ z, check_finite=False)
+        c = cho_solve_banded(factor, self.transposed @ z, check_finite=False)
         return c, z - self.basis @ c
 
     def degrees_of_freedom(self, lam: float) -> float:

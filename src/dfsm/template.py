@@ -54,10 +54,8 @@ linear:
 {linear}
 
 corrective:
-  kind: rbf           # rbf, rbf_incremental, gp, mlp or none; docs/method.md lists their keys
-  samples: 200        # units (not for mlp and none: remove the three lines below kind)
-  sampling: kmeans    # kmeans, maxmin or random
-  targets: all        # or cluster_means, as in the paper
+  kind: mlp           # or rbf, rbf_incremental, gp, none; docs/method.md lists their keys
+  hidden: [20, 20]    # units per layer
 
 gate: 0.01            # correct a row only if its residual exceeds this share of the signal
 azimuth: {azimuth}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dfsm.errors import DfsmError, near_matches
+from dfsm.errors import DfsmError, missing, printable
 from dfsm.types import Array
 
 if TYPE_CHECKING:
@@ -51,6 +51,12 @@ class Channel:
     def label(self) -> str:
         """Name and unit as an axis label shows them."""
         return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+def labels(channels: Sequence[Channel], most: int = 8) -> str:
+    """Names and units of the first channels, for one line of text."""
+    shown = ", ".join(printable(c.label) for c in channels[:most])
+    return f"{shown}, …" if len(channels) > most else shown or "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +145,13 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time)
 
+    def __repr__(self) -> str:
+        every = "irregular" if self.time_step is None else f"every {self.time_step:g} s"
+        return (
+            f"<Trajectory {printable(self.name)}: {len(self)} samples, {self.time[0]:g} to "
+            f"{self.time[-1]:g} s, {every}; {len(self.channels)} channels: {labels(self.channels)}>"
+        )
+
     def __contains__(self, name: str) -> bool:
         return name in self._columns
 
@@ -154,12 +167,20 @@ class Trajectory:
         DfsmError
             No such channel; the message names the file and suggests near names.
         """
-        try:
-            return self._columns[name]
-        except KeyError:
-            raise DfsmError(
-                f"{self.where}: no channel '{name}'; {near_matches(name, self.names)}"
-            ) from None
+        return self.columns([name])[0]
+
+    def columns(self, names: Iterable[str]) -> list[int]:
+        """Columns of several channels.
+
+        Raises
+        ------
+        DfsmError
+            Names all channels that are missing, as `column` does one.
+        """
+        names = list(names)
+        if lost := [n for n in dict.fromkeys(names) if n not in self._columns]:
+            raise DfsmError(f"{self.where}: {missing(lost, self.names)}")
+        return [self._columns[n] for n in names]
 
     def channel(self, name: str) -> Channel:
         """Return the description of one channel."""
@@ -182,7 +203,7 @@ class Trajectory:
 
     def select(self, names: Iterable[str]) -> Trajectory:
         """Keep the named channels, in the order given."""
-        columns = [self.column(n) for n in names]
+        columns = self.columns(names)
         return replace(
             self,
             values=self.values[:, columns],
@@ -234,8 +255,7 @@ class Trajectory:
 
     def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
         """Set the roles of the named channels; the others keep theirs."""
-        for name in roles:
-            self.column(name)
+        self.columns(roles)
         return replace(
             self, channels=tuple(replace(c, role=roles.get(c.name, c.role)) for c in self.channels)
         )
@@ -366,6 +386,14 @@ class Dataset(Sequence[Trajectory]):
 
     def __len__(self) -> int:
         return len(self.runs)
+
+    def __repr__(self) -> str:
+        shared = [self.runs[0].channel(n) for n in self.names]
+        return (
+            f"<Dataset: {len(self)} runs, {sum(map(len, self.runs))} samples, "
+            f"{sum(r.duration for r in self.runs):g} s; {len(shared)} channels in every run: "
+            f"{labels(shared)}>"
+        )
 
     @overload
     def __getitem__(self, index: int) -> Trajectory: ...

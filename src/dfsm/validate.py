@@ -75,6 +75,8 @@ def validate(
     runs = [with_corrected_wind(r, first.signals.hub_height) for r in runs]
     if not runs:
         raise DfsmError("no test runs were given, at least one is needed")
+    for run in runs:
+        run.columns(first.signals.recorded)
     notes = _leaks(first, runs)
     results = []
     for run in track(runs, "test runs"):
@@ -205,18 +207,18 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
 def _all_statistics(
     run: Trajectory, bands: Sequence[Band], loads: Sequence[str]
 ) -> dict[str, ChannelStatistics]:
+    if run.time_step is None:
+        # Spectra need an equidistant mesh; the median step keeps what the samples resolve.
+        step = float(np.median(np.diff(run.time)))
+        run = run.resample(np.arange(run.time[0], run.time[-1], step))
     return {c.name: _statistics(run, c.name, bands, c.name in loads) for c in run.channels}
 
 
 def _statistics(
     run: Trajectory, name: str, bands: Sequence[Band], is_load: bool
 ) -> ChannelStatistics:
-    values, time = run[name], run.time
-    if run.time_step is None:
-        # Spectra need an equidistant mesh; the median step keeps what the samples resolve.
-        time = np.arange(time[0], time[-1], float(np.median(np.diff(time))))
-        values = np.interp(time, run.time, values)
-    psd = spectrum(time, values)
+    values = run[name]
+    psd = spectrum(run.time, values)
     damage = {}
     if is_load:
         damage = {

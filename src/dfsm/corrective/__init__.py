@@ -81,4 +81,4 @@ def fit_corrective(
     points = subsample(data.z, choice.samples, choice.sampling, seed)
     if isinstance(choice, GP):
         return fit_gp(data, points, choice, seed)
-    return fit_rbf(data, points, choice)
+    return fit_rbf(data, points, choice, seed)

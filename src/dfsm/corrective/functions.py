@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import dfsm.precision  # noqa: F401
+import dfsm.jax_setup  # noqa: F401
 
 
 class GaussianUnits(eqx.Module):

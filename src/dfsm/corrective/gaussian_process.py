@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
+from dfsm.corrective.length_scales import hyper_parameters
 from dfsm.corrective.training import CorrectiveFit, TrainingSet, cross_validated
 from dfsm.corrective.units import activations, gaussian_units, mean_diagonal, unit_sums
 from dfsm.sampling import Method, Subsample
@@ -44,7 +44,7 @@ class GP:
 def fit_gp(data: TrainingSet, points: Subsample, choice: GP, seed: int) -> CorrectiveFit:
     """Train a Gaussian process; one kernel is shared by all targets."""
     means = points.means(data.targets)
-    signal, noise, lengths = _hyper_parameters(points.points, means, seed)
+    signal, noise, lengths = hyper_parameters(points.points, means, seed)
     kernel = _Kernel(points.points, np.sqrt(2.0) * lengths, signal)
     # The scatter within the clusters is the noise of single samples; that of means is smaller.
     scatter = noise + float(np.mean((data.targets - means[points.labels]) ** 2))
@@ -89,20 +89,3 @@ class _Kernel:
     def predictor(self, data: TrainingSet, noise: float) -> Callable[[Array], Array]:
         weights = self.sparse_weights(data, noise)
         return lambda z: activations(z, self.points, self.width) @ weights
-
-
-def _hyper_parameters(z: Array, targets: Array, seed: int) -> tuple[float, float, Array]:
-    """Signal variance, noise variance and length scales that maximise the marginal likelihood."""
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor, kernels
-
-    d = z.shape[1]
-    lengths: Any = np.full(d, np.sqrt(d))
-    kernel = kernels.ConstantKernel(0.5, (1e-4, 1e3)) * kernels.RBF(lengths, (0.2, 1e3))
-    kernel = kernel + kernels.WhiteKernel(0.1, (1e-10, 1e2))
-    with warnings.catch_warnings():
-        # A length scale at its bound means an input that does not matter: nothing to act on.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted: Any = GaussianProcessRegressor(kernel, random_state=seed).fit(z, targets).kernel_
-    lengths = np.broadcast_to(fitted.k1.k2.length_scale, (d,))
-    return float(fitted.k1.k1.constant_value), float(fitted.k2.noise_level), lengths

@@ -1,127 +1,124 @@
-"""Multi-layer perceptron trained with exact gradients."""
+"""Multi-layer perceptron trained by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import islice, pairwise
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.optimize import OptimizeResult, minimize
 
 from dfsm.corrective.functions import Perceptron
-from dfsm.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
+from dfsm.corrective.levenberg_marquardt import Network, Step, levenberg_marquardt
+from dfsm.corrective.training import CorrectiveFit, TrainingSet
+from dfsm.progress import track
 from dfsm.settings import require, settings
 from dfsm.types import Array
 
 Layers = tuple[tuple[jax.Array, jax.Array], ...]
 
-# Iterations without progress on the held-out runs after which training stops.
-_PATIENCE = 40
+# Steps without progress on the held-out runs after which training stops.
+_PATIENCE = 10
+# Of the steps taken on three quarters of the runs, this share again on all of them.
+_POLISH = 0.5
 
 
 @settings
 class MLP:
-    """Multi-layer perceptron with tanh units, trained by L-BFGS with exact gradients.
+    """Multi-layer perceptron with tanh units, trained by Levenberg-Marquardt.
 
     Attributes
     ----------
     hidden
         Units per hidden layer.
     iterations
-        Largest number of L-BFGS iterations; training stops earlier when the held-out quarter of
-        the runs no longer improves.
+        Largest number of training steps; training stops earlier when the held-out quarter of
+        the runs no longer improves. Half as many steps on all runs follow.
     weight_decay
-        Penalty on the mean square of the weights.
+        Penalty on the squared weights, per sample of standardised targets.
+    samples
+        Samples used for training, evenly thinned: neighbours in time are near copies.
     """
 
     kind: Literal["mlp"] = "mlp"
-    hidden: tuple[int, ...] = (24, 24)
-    iterations: int = 300
-    weight_decay: float = 1e-4
+    hidden: tuple[int, ...] = (20, 20)
+    iterations: int = 60
+    weight_decay: float = 1e-8
+    samples: int = 8000
 
     def __post_init__(self) -> None:
         wide = all(n >= 1 for n in self.hidden)
         require(wide, "corrective.hidden", list(self.hidden), "at least 1 unit per layer")
         require(self.iterations >= 1, "corrective.iterations", self.iterations, "at least 1")
         require(self.weight_decay >= 0, "corrective.weight_decay", self.weight_decay, "0 or more")
+        require(self.samples >= 1, "corrective.samples", self.samples, "at least 1")
 
 
 def fit_mlp(data: TrainingSet, choice: MLP, seed: int) -> CorrectiveFit:
     """Train a perceptron; the last fold of the runs decides when to stop."""
-    search = data.thinned(SEARCH_SAMPLES)
-    last = search.folds == search.folds.max()
-    train, held = search.subset(~last), search.subset(last)
+    data = data.thinned(choice.samples)
+    last = data.folds == data.folds.max()
+    train, held = data.subset(~last), data.subset(last)
     sizes = (data.z.shape[1], *choice.hidden, data.targets.shape[1])
-    layers, iterations = _train(train, held, sizes, choice, seed)
-    predicted = np.asarray(_forward(layers, jnp.asarray(held.z)))
-    total = ((held.targets - train.targets.mean(0)) ** 2).sum(0)
+    start, unravel = ravel_pytree(_start(sizes, seed))
+
+    def network(w: jax.Array, z: jax.Array) -> jax.Array:
+        return _forward(unravel(w), z)
+
+    @jax.jit
+    def held_error(w: Array) -> jax.Array:
+        predicted = jax.vmap(network, (None, 0))(jnp.asarray(w), jnp.asarray(held.z))
+        return jnp.mean((predicted - jnp.asarray(held.targets)) ** 2, axis=0)
+
+    best, error, taken = Step(np.asarray(start)), np.asarray(held_error(np.asarray(start))), 0
+    for count, step in _steps(network, best, train, choice, choice.iterations):
+        now = np.asarray(held_error(step.weights))
+        if now.sum() < error.sum():
+            best, error, taken = step, now, count
+        elif count - taken >= _PATIENCE:
+            break
+    final = best
+    for _, step in _steps(network, best, data, choice, round(_POLISH * taken)):
+        final = step
+    layers = unravel(jnp.asarray(final.weights))
     scale = jnp.asarray(data.target_scale)
     W, b = layers[-1]
-    layers = (*layers[:-1], (W * scale[:, None], b * scale))
     function = Perceptron(
         shift=jnp.asarray(data.shift),
         scale=jnp.asarray(data.scale),
-        weights=tuple(W for W, _ in layers),
-        biases=tuple(b for _, b in layers),
+        weights=(*(W for W, _ in layers[:-1]), W * scale[:, None]),
+        biases=(*(b for _, b in layers[:-1]), b * scale),
     )
     return CorrectiveFit(
         function=function,
-        explained=1 - ((held.targets - predicted) ** 2).sum(0) / total,
-        detail=f"{'-'.join(map(str, sizes))} tanh network, {iterations} L-BFGS iterations",
+        explained=1 - error / ((held.targets - train.targets.mean(0)) ** 2).mean(0),
+        detail=f"{'-'.join(map(str, sizes))} tanh network, {taken} training steps",
     )
+
+
+def _start(sizes: Sequence[int], seed: int) -> Layers:
+    """Random hidden layers under an output of zero: the first step is a linear fit to them."""
+    rng = np.random.default_rng(seed)
+    hidden = [
+        (jnp.asarray(rng.normal(size=(o, i)) / np.sqrt(i)), jnp.asarray(rng.normal(0, 0.5, o)))
+        for i, o in pairwise(sizes[:-1])
+    ]
+    return (*hidden, (jnp.zeros((sizes[-1], sizes[-2])), jnp.zeros(sizes[-1])))
+
+
+def _steps(
+    network: Network, start: Step, data: TrainingSet, choice: MLP, limit: int
+) -> Iterator[tuple[int, Step]]:
+    """At most `limit` training steps, counted from 1, with a progress bar."""
+    steps = levenberg_marquardt(network, start, data.z, data.targets, choice.weight_decay)
+    yield from enumerate(track(islice(steps, limit), "training", limit), start=1)
 
 
 def _forward(layers: Layers, z: jax.Array) -> jax.Array:
     for W, b in layers[:-1]:
-        z = jnp.tanh(z @ W.T + b)
+        z = jnp.tanh(W @ z + b)
     W, b = layers[-1]
-    return z @ W.T + b
-
-
-def _train(
-    train: TrainingSet, held: TrainingSet, sizes: Sequence[int], choice: MLP, seed: int
-) -> tuple[Layers, int]:
-    """Layers with the lowest error on `held`, and the iteration that gave them."""
-    z, y = jnp.asarray(train.z), jnp.asarray(train.targets)
-    keys = jax.random.split(jax.random.key(seed), len(sizes) - 1)
-    start = tuple(
-        (jax.random.normal(k, (o, i)) / np.sqrt(i), jnp.zeros(o))
-        for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=True)
-    )
-    flat, unravel = ravel_pytree(start)
-
-    @jax.jit
-    @jax.value_and_grad
-    def loss(flat: jax.Array) -> jax.Array:
-        layers = unravel(flat)
-        penalty = sum(jnp.sum(W**2) for W, _ in layers) / flat.size
-        return jnp.mean((_forward(layers, z) - y) ** 2) + choice.weight_decay * penalty
-
-    @jax.jit
-    def held_error(flat: jax.Array, z: jax.Array, y: jax.Array) -> jax.Array:
-        return jnp.mean((_forward(unravel(flat), z) - y) ** 2)
-
-    best, count = (np.inf, flat, 0), 0
-
-    def objective(x: Array) -> tuple[float, Array]:
-        value, slope = loss(jnp.asarray(x))
-        return float(value), np.asarray(slope)
-
-    def watch(intermediate_result: OptimizeResult) -> None:
-        nonlocal best, count
-        count += 1
-        x = jnp.asarray(intermediate_result.x)
-        error = float(held_error(x, jnp.asarray(held.z), jnp.asarray(held.targets)))
-        if error < best[0]:
-            best = (error, x, count)
-        elif count - best[2] > _PATIENCE:
-            raise StopIteration
-
-    options = {"maxiter": choice.iterations, "maxcor": 30}
-    minimize(
-        objective, np.asarray(flat), jac=True, method="L-BFGS-B", callback=watch, options=options
-    )
-    return unravel(best[1]), best[2]
+    return W @ z + b

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from dfsm.corrective.length_scales import hyper_parameters
 from dfsm.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
 from dfsm.corrective.units import gaussian_units, unit_sums
 from dfsm.least_squares import NormalEquations, merge
@@ -18,6 +20,8 @@ from dfsm.types import Array, IntArray
 # the neighbours of the best.
 _WIDTHS = (0.5, 1.0, 2.0)
 _FINER = np.sqrt(2.0)
+# Cluster means that the length scales are found from: the work grows with their third power.
+_LENGTH_POINTS = 200
 _RIDGES = 10.0 ** np.arange(-9.0, 1.0)
 
 
@@ -35,8 +39,12 @@ class RBF:
         ``"all"`` fits the weights to every sample; ``"cluster_means"`` to the means over the
         clusters, as the paper does.
     width
-        Width of the units relative to the typical distance between two standardised samples;
-        None chooses it by cross-validation over runs.
+        Width of the units relative to the typical distance between two samples; None chooses it
+        by cross-validation over runs.
+    directions
+        ``"per_input"`` makes the units as long in the direction of each input as a Gaussian
+        process through the cluster means finds the function to be; ``"equal"`` as long in all
+        standardised inputs, as in the paper.
     """
 
     kind: Literal["rbf"] = "rbf"
@@ -44,6 +52,7 @@ class RBF:
     sampling: Method = "kmeans"
     targets: Literal["all", "cluster_means"] = "all"
     width: float | None = None
+    directions: Literal["per_input", "equal"] = "per_input"
 
     def __post_init__(self) -> None:
         _check_units(self.samples, self.width)
@@ -62,7 +71,7 @@ class IncrementalRBF:
         Mean-square error to stop at, as a fraction of the residual's mean square.
     neurons
         Largest number of units.
-    samples, sampling, targets, width
+    samples, sampling, targets, width, directions
         As for `RBF`; the subsample provides the candidates.
     """
 
@@ -73,6 +82,7 @@ class IncrementalRBF:
     sampling: Method = "kmeans"
     targets: Literal["all", "cluster_means"] = "all"
     width: float | None = None
+    directions: Literal["per_input", "equal"] = "per_input"
 
     def __post_init__(self) -> None:
         _check_units(self.samples, self.width)
@@ -86,8 +96,14 @@ def _check_units(samples: int, width: float | None) -> None:
     require(positive, "corrective.width", width, "a positive number")
 
 
-def fit_rbf(data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF) -> CorrectiveFit:
+def fit_rbf(
+    data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF, seed: int
+) -> CorrectiveFit:
     """Train an RBF network: width and ridge by cross-validation, then weights on all targets."""
+    if choice.directions == "per_input":
+        lengths = _relative_lengths(data, points, seed)
+        data = replace(data, z=data.z / lengths, scale=data.scale * lengths)
+        points = replace(points, points=points.points / lengths)
     base = data.typical_distance
     search = data.thinned(SEARCH_SAMPLES)
 
@@ -117,6 +133,13 @@ def fit_rbf(data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF) 
     ridges = ", ".join(f"{r:.0e}" for r in ridge)
     detail = f"{len(used)} Gaussian units, relative width {width:.2g}, ridge {ridges}"
     return CorrectiveFit(function, 1 - error, detail)
+
+
+def _relative_lengths(data: TrainingSet, points: Subsample, seed: int) -> Array:
+    """Length scale of every input over their geometric mean, from some of the cluster means."""
+    some = slice(None, None, -(-len(points.points) // _LENGTH_POINTS))
+    *_, lengths = hyper_parameters(points.points[some], points.means(data.targets)[some], seed)
+    return lengths / np.exp(np.log(lengths).mean())
 
 
 def _final_sums(

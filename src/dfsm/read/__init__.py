@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 from dfsm.errors import DfsmError
 from dfsm.progress import track
 from dfsm.read.assemble import existing_file
-from dfsm.read.info import ChannelInfo, RunInfo, describe
+from dfsm.read.info import ChannelInfo, RunInfo, describe, gap_warning
 from dfsm.read.openfast import read_openfast
 from dfsm.read.tables import read_table, write_table
 from dfsm.read.wind import undisturbed_rotor_wind, wind_warning
@@ -21,6 +22,7 @@ __all__ = [
     "ChannelInfo",
     "RunInfo",
     "describe",
+    "gap_warning",
     "read",
     "read_all",
     "read_openfast",
@@ -118,7 +120,7 @@ def with_wall_times(runs: Iterable[Trajectory], path: str | Path) -> list[Trajec
     Raises
     ------
     DfsmError
-        The file is missing or holds something else.
+        The file is missing or holds something else, or a time is not positive.
     """
     path = existing_file(path)
     try:
@@ -126,6 +128,12 @@ def with_wall_times(runs: Iterable[Trajectory], path: str | Path) -> list[Trajec
         seconds = {str(name): float(value) for name, value in table.items()}
     except (ValueError, TypeError, AttributeError):
         raise DfsmError(f"{path} is not a JSON table of run names and seconds") from None
+    for name, value in seconds.items():
+        if not (math.isfinite(value) and value > 0):
+            raise DfsmError(
+                f"{path}: the wall time of '{name}' is {value:g} s, expected a positive number: "
+                "correct it or leave the run out"
+            )
     return [replace(r, wall_time=seconds.get(r.name, r.wall_time)) for r in runs]
 
 

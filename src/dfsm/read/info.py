@@ -133,15 +133,33 @@ def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
 _GAP = 20.0
 
 
-def _warnings(trajectory: Trajectory) -> list[str]:
-    found = []
+def gap_warning(trajectory: Trajectory) -> str | None:
+    """Say where the time mesh has its longest hole, if it has one.
+
+    Parameters
+    ----------
+    trajectory
+        Any run, or the part of one that is used.
+
+    Returns
+    -------
+    str | None
+        One sentence that does not name the run; None where no step is a hole.
+    """
     steps = np.diff(trajectory.time)
     gap = int(np.argmax(steps))
-    if steps[gap] > _GAP * np.median(steps):
-        found.append(
-            f"there is a gap of {steps[gap]:g} s after {trajectory.time[gap]:g} s: a fit would "
-            "bridge it with a spline"
-        )
+    if steps[gap] <= _GAP * np.median(steps):
+        return None
+    return (
+        f"there is a gap of {steps[gap]:g} s after {trajectory.time[gap]:g} s, which a fit bridges "
+        "with a spline: split the run there, or choose a time window without it"
+    )
+
+
+def _warnings(trajectory: Trajectory) -> list[str]:
+    found = []
+    if gap := gap_warning(trajectory):
+        found.append(gap)
     seen: dict[bytes, str] = {}
     for name, values in zip(trajectory.names, trajectory.values.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))

@@ -10,7 +10,7 @@ import numpy as np
 
 from dfsm.errors import DfsmError
 from dfsm.read.assemble import assemble
-from dfsm.read.columns import TIME_NAMES, time_column
+from dfsm.read.columns import TIME_NAMES, kept_columns, time_column
 from dfsm.trajectory import Channel, Trajectory
 
 MAT_TIME_NAMES = (*TIME_NAMES, "tout")
@@ -69,8 +69,8 @@ def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:
         )
     channels = [Channel(n, u.strip("()[]")) for n, u in zip(names, units, strict=True)]
     time = time_column(path, channels)
-    keep = [i for i in range(len(channels)) if i != time]
-    return assemble(path, table[:, time], table[:, keep], [channels[i] for i in keep])
+    keep, notes = kept_columns(path, channels, list(table.T), time)
+    return assemble(path, table[:, time], table[:, keep], [channels[i] for i in keep], notes=notes)
 
 
 def _from_vectors(path: Path, content: Mapping[str, Any]) -> Trajectory:

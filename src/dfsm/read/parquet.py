@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dfsm.errors import DfsmError
 from dfsm.files import write_file
 from dfsm.read.assemble import assemble
-from dfsm.read.columns import SECONDS, split_header, time_column
+from dfsm.read.columns import SECONDS, kept_columns, split_header, time_column
 from dfsm.trajectory import Array, Channel, Role, Trajectory
 
 if TYPE_CHECKING:
@@ -51,22 +51,22 @@ def read_parquet(path: Path) -> Trajectory:
     channels = [_channel(path, table.schema.field(i), units) for i in range(table.num_columns)]
     columns = [_column(path, table, i) for i in range(table.num_columns)]
     if "dfsm.time_start" in schema:
-        start = _number(path, schema, "dfsm.time_start")
+        at, start = None, _number(path, schema, "dfsm.time_start")
         time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
     else:
         at = _time_index(path, table.schema, channels, schema)
-        time = columns.pop(at)
-        channels.pop(at)
-    if not columns:
+        time = columns[at]
+    keep, notes = kept_columns(path, channels, columns, at)
+    if not keep:
         raise DfsmError(f"{path}: no channel besides time, at least one is needed")
     return assemble(
         path,
         time,
-        np.stack(columns, axis=1),
-        channels,
+        np.stack([columns[i] for i in keep], axis=1),
+        [channels[i] for i in keep],
         name=schema.get("dfsm.name"),
         wall_time=_number(path, schema, "dfsm.wall_time") if "dfsm.wall_time" in schema else None,
-        notes=_notes(path, schema),
+        notes=(*_notes(path, schema), *notes),
     )
 
 

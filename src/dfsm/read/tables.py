@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from dfsm.errors import DfsmError
 from dfsm.files import write_file
 from dfsm.read.assemble import assemble, existing_file
-from dfsm.read.columns import split_header, time_column
+from dfsm.read.columns import kept_columns, split_header, time_column
 from dfsm.read.mat import read_mat
 from dfsm.read.parquet import read_parquet, write_parquet
 from dfsm.trajectory import Channel, Trajectory
@@ -85,6 +86,11 @@ def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = Fals
                 f"{trajectory.where}: a channel called '{name}' cannot be told from the time in a "
                 "table: leave it out or rename it"
             )
+        if not name.strip():
+            raise DfsmError(
+                f"{trajectory.where}: a channel has no name, by which a table could be read again: "
+                "give it one"
+            )
     if suffix == ".csv":
         _write_csv(trajectory, path)
     else:
@@ -128,15 +134,15 @@ def _read_csv(path: Path) -> Trajectory:
         if len(row) != len(channels):
             raise DfsmError(
                 f"{path}, line {number}: {len(row)} values, but the header names {len(channels)} "
-                "columns: correct or remove the line"
+                f"columns: {_cure(row, len(channels), delimiter)}"
             )
     cells = [[c.strip() or "nan" for c in row] for row in rows[1:]]
     try:
         data = np.array(cells, dtype=np.float64).reshape(len(cells), len(channels))
     except ValueError:
         raise _bad_cell(path, cells, numbers[1:]) from None
-    keep = [i for i in range(len(channels)) if i != time]
-    return assemble(path, data[:, time], data[:, keep], [channels[i] for i in keep])
+    keep, notes = kept_columns(path, channels, list(data.T), time)
+    return assemble(path, data[:, time], data[:, keep], [channels[i] for i in keep], notes=notes)
 
 
 def _decode(path: Path) -> str:
@@ -156,15 +162,25 @@ def _decode(path: Path) -> str:
     raise DfsmError(f"{path} is damaged UTF-16 text: save it as UTF-8")
 
 
+def _cure(row: list[str], columns: int, delimiter: str) -> str:
+    # A comma between digits that was meant as a decimal point makes two cells of one.
+    whole = all(re.fullmatch(r"\s*[-+]?\d+\s*", cell) for cell in row)
+    if delimiter == "," and whole and columns < len(row) <= 2 * columns:
+        return "if its decimals have commas, save it with points; else correct or remove the line"
+    return "correct or remove the line"
+
+
 def _bad_cell(path: Path, cells: list[list[str]], numbers: list[int]) -> DfsmError:
     for row, number in zip(cells, numbers, strict=True):
         for column, text in enumerate(row, start=1):
             try:
                 float(text)
             except ValueError:
+                cure = "correct it"
+                if re.fullmatch(r"[-+]?\d*,\d*(e[-+]?\d+)?", text, re.IGNORECASE):
+                    cure = "decimals have a comma here, save the table with points"
                 return DfsmError(
-                    f"{path}, line {number}: {text[:24]!r} in column {column} is no number: "
-                    "correct it, with a point for the decimals"
+                    f"{path}, line {number}: {text[:24]!r} in column {column} is no number: {cure}"
                 )
     return DfsmError(f"{path}: its rows make no table of numbers: check the file")
 

@@ -54,7 +54,7 @@ def undisturbed_rotor_wind(
         raise DfsmError(f"hub_height is {hub_height}, expected a positive height in m")
     if name in trajectory:
         raise DfsmError(f"{trajectory.where}: channel '{name}' exists already: give another name")
-    source, motion = trajectory.channel(wind), trajectory.channel(rate)
+    source, motion = (trajectory.channels[i] for i in trajectory.columns((wind, rate)))
     if source.unit not in ("m/s", "m/sec"):
         raise DfsmError(
             f"{trajectory.where}: '{wind}' is in '{source.unit}', expected m/s: convert it first"
