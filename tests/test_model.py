@@ -482,7 +482,7 @@ def test_a_correction_that_is_not_worthwhile(duffing_runs, monkeypatch, share, t
     def trained(inputs, residuals, *_):
         return SimpleNamespace(explained=np.full(residuals.shape[1], share), detail="")
 
-    monkeypatch.setattr(importlib.import_module("dfsm.fit"), "fit_corrective", trained)
+    monkeypatch.setattr(importlib.import_module("dfsm.correction"), "fit_corrective", trained)
     choices = replace(LINEAR, states=SECOND, outputs=("y", "z"), nonlinear_only=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DfsmWarning)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from dfsm.correction import destabilised
+from dfsm.corrective import GaussianUnits
 from dfsm.errors import DfsmError
 from dfsm.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
 from dfsm.stability import stabilise, state_matrix
 from dfsm.types import Array
+from systems import OSCILLATOR_A, linear_model
 
 # Inputs [u, w, x1, x2, v1, v2]; x' = v is known, v' is fitted.
 NAMES = ["u", "w", "x1", "x2", "v1", "v2"]
@@ -116,3 +120,19 @@ def test_a_mode_out_of_reach_is_an_error() -> None:
     plain = fit_linear([(inputs, targets)], ["a", "b"], LTI())
     with pytest.raises(DfsmError, match="no stable linear fit was found"):
         stabilise(plain, slice(0, 2), {0: 0}, 0.1, affine=True)
+
+
+def test_a_correction_that_destabilises_an_operating_point_is_named():
+    def bumps(height: float) -> GaussianUnits:
+        # Two units at ±1 of the last state: an odd function with a slope at its middle.
+        centres = jnp.zeros((3, 2)).at[2].set(jnp.array([-1.0, 1.0]))
+        weights = jnp.array([[-height, height]])
+        return GaussianUnits(jnp.zeros(3), jnp.ones(3), centres, weights, jnp.zeros(1))
+
+    B = np.array([[0.0], [2.0]])
+    assert destabilised(linear_model(OSCILLATOR_A, B)) is None
+    assert destabilised(linear_model(OSCILLATOR_A, B, corrective=bumps(-1.0))) is None
+    said = destabilised(linear_model(OSCILLATOR_A, B, corrective=bumps(1.0)))
+    growth = np.linalg.eigvals(OSCILLATOR_A + np.diag([0.0, 4 * np.exp(-1)])).real.max()
+    assert growth > 0
+    assert said == f"with a correction the model would be unstable (growth {growth:.2g} 1/s)"

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from dfsm.correction import correct, destabilised
 from dfsm.corrective import Corrective, NoCorrection, fit_corrective
 from dfsm.derivatives import kinematic_rows
 from dfsm.errors import DfsmError, DfsmWarning
@@ -34,10 +33,6 @@ from dfsm.types import Array
 
 # Operating points along the schedule: means of the inputs over equally filled bins.
 _OPERATING_POINTS = 12
-# A correction is kept if it explains at least this share of the residual's variance on runs left
-# out of training. Less than that is within what cross-validation finds in noise, and may undo what
-# a stable linear fit has gained.
-_WORTHWHILE = 0.01
 # Training runs that are simulated to check a new model.
 _CHECK_RUNS = 8
 
@@ -102,8 +97,8 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
         f = _fit_derivatives(samples, choices)
         g = _fit_outputs(samples, choices)
     with _timed(seconds, "corrective functions"):
-        e = _correct(samples, samples.inputs, samples.derivatives, f, choices)
-        e_g = _correct(samples, _output_inputs(samples), samples.outputs, g, choices) if g else None
+        e = correct(samples, samples.inputs, samples.derivatives, f, choices)
+        e_g = correct(samples, _output_inputs(samples), samples.outputs, g, choices) if g else None
     model = DFSM(
         f=f.model,
         e=e.function,
@@ -114,6 +109,8 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
         corrected_outputs=e_g.rows if e_g else (),
         signals=samples.signals,
     )
+    if choices.linear.margin is not None and (harm := destabilised(model)):
+        model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     with _timed(seconds, "checks"):
         notes, checks = _check(model, samples, data, choices)
     notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
@@ -206,86 +203,7 @@ def _linear(samples: Samples, inputs: Array, targets: Array, choices: FitSetting
     return fit_linear(samples.blocks(inputs, targets), names, choices.linear, windows)
 
 
-# -- corrective functions (Sec. 3.5, 3.6) -------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Correction:
-    function: Corrective | None
-    rows: tuple[int, ...]
-    decisions: list[dict[str, Any]]
-
-
-def _correct(
-    samples: Samples, inputs: Array, targets: Array, linear: LinearFit, choices: FitSettings
-) -> _Correction:
-    """Train a corrective function for the rows whose residual is large, and say which and why."""
-    residuals = targets - _predict(linear.model, samples, inputs, targets)
-    rms, std = np.sqrt(np.mean(residuals**2, axis=0)), targets.std(axis=0)
-    ratio = rms / np.maximum(std, np.finfo(float).tiny)
-    derivatives = targets is samples.derivatives
-    known = kinematic_rows(choices.states) if derivatives else {}
-    large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > choices.gate]
-    function, explained, detail = None, dict[int, float](), ""
-    if large and not isinstance(choices.corrective, NoCorrection):
-        trained = fit_corrective(
-            inputs, residuals[:, large], samples.runs, choices.corrective, choices.seed
-        )
-        explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
-        # A correction that does no good on runs left out of training would only do harm.
-        kept = [k for k, share in enumerate(trained.explained) if share > _WORTHWHILE]
-        function = trained.function.select(kept) if kept else None
-        large = [large[k] for k in kept]
-    else:
-        large = []
-    decisions = []
-    for i, (name, unit) in enumerate(_target_names(samples, derivatives)):
-        if i in known:
-            text = "kinematic, its rate is a state"
-        elif ratio[i] <= choices.gate:
-            text = f"linear fit, residual {ratio[i]:.1%} of the signal (gate {choices.gate:.1%})"
-        elif i in large:
-            text = (
-                f"corrected, residual {ratio[i]:.1%} of the signal, of whose variance "
-                f"{explained[i]:.1%} is explained in cross-validation ({detail})"
-            )
-        elif i in explained:
-            text = f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains "
-            if explained[i] < 0.001:  # negative where it would do harm
-                text += "nothing on data left out of its training"
-            else:
-                text += f"only {explained[i]:.1%} of its variance in cross-validation"
-        else:
-            text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
-        decisions.append(
-            {
-                "name": name,
-                "unit": unit,
-                "std": float(std[i]),
-                "residual_rms": float(rms[i]),
-                "explained": float(explained[i]) if i in explained else None,
-                "corrected": i in large,
-                "decision": text,
-            }
-        )
-    return _Correction(function, tuple(large), decisions)
-
-
-def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
-    """Evaluate the linear fit run by run, so that memory stays bounded."""
-    parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
-    return np.concatenate([np.asarray(p) for p in parts])
-
-
-@eqx.filter_jit
-def _apply(model: Any, inputs: Array) -> jax.Array:
-    return jax.vmap(model)(jnp.asarray(inputs))
-
-
-def _target_names(samples: Samples, derivatives: bool) -> Sequence[tuple[str, str]]:
-    if derivatives:
-        return samples.derivative_names
-    return [(c.name, c.unit) for c in samples.signals.outputs]
+# -- nonlinear-only, for comparison --------------------------------------------------------------
 
 
 def _fit_nonlinear(samples: Samples, region: Region, choices: FitSettings) -> DFSM:

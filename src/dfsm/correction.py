@@ -1,0 +1,166 @@
+"""Which rows are corrected, by what, and whether that does good (Sec. 3.5, 3.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.corrective import Corrective, NoCorrection, fit_corrective
+from dfsm.derivatives import kinematic_rows
+from dfsm.linear import LinearFit, LinearModel
+from dfsm.model import DFSM
+from dfsm.samples import FitSettings, Samples
+from dfsm.types import Array
+
+# A correction is kept if it explains at least this share of the residual's variance on runs left
+# out of training. Less than that is within what cross-validation finds in noise, and may undo what
+# a stable linear fit has gained.
+_WORTHWHILE = 0.01
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A corrective function and why it is there, or not.
+
+    Attributes
+    ----------
+    function
+        None where no row is corrected.
+    rows
+        Targets that it adds to.
+    decisions
+        For every target its figures and the decision in words; JSON values.
+    """
+
+    function: Corrective | None
+    rows: tuple[int, ...]
+    decisions: list[dict[str, Any]]
+
+    def withdrawn(self, reason: str) -> Correction:
+        """No correction after all, with the reason in the decisions."""
+        decisions = [
+            d | {"corrected": False, "decision": f"linear fit: {reason}"} if d["corrected"] else d
+            for d in self.decisions
+        ]
+        return Correction(None, (), decisions)
+
+
+def correct(
+    samples: Samples, inputs: Array, targets: Array, linear: LinearFit, choices: FitSettings
+) -> Correction:
+    """Train a corrective function for the rows whose residual is large, and say which and why.
+
+    Parameters
+    ----------
+    samples
+        All training samples.
+    inputs, targets
+        What is fitted on what, shapes ``(sample, input)`` and ``(sample, target)``.
+    linear
+        The linear fit of the targets.
+    choices
+        Settings.
+
+    Returns
+    -------
+    Correction
+    """
+    residuals = targets - _predict(linear.model, samples, inputs, targets)
+    rms, std = np.sqrt(np.mean(residuals**2, axis=0)), targets.std(axis=0)
+    ratio = rms / np.maximum(std, np.finfo(float).tiny)
+    derivatives = targets is samples.derivatives
+    known = kinematic_rows(choices.states) if derivatives else {}
+    large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > choices.gate]
+    function, explained, detail = None, dict[int, float](), ""
+    if large and not isinstance(choices.corrective, NoCorrection):
+        trained = fit_corrective(
+            inputs, residuals[:, large], samples.runs, choices.corrective, choices.seed
+        )
+        explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
+        # A correction that does no good on runs left out of training would only do harm.
+        kept = [k for k, share in enumerate(trained.explained) if share > _WORTHWHILE]
+        function = trained.function.select(kept) if kept else None
+        large = [large[k] for k in kept]
+    else:
+        large = []
+    decisions = []
+    for i, (name, unit) in enumerate(_target_names(samples, derivatives)):
+        if i in known:
+            text = "kinematic, its rate is a state"
+        elif ratio[i] <= choices.gate:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal (gate {choices.gate:.1%})"
+        elif i in large:
+            text = (
+                f"corrected, residual {ratio[i]:.1%} of the signal, of whose variance "
+                f"{explained[i]:.1%} is explained in cross-validation ({detail})"
+            )
+        elif i in explained:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains "
+            if explained[i] < 0.001:  # negative where it would do harm
+                text += "nothing on data left out of its training"
+            else:
+                text += f"only {explained[i]:.1%} of its variance in cross-validation"
+        else:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
+        decisions.append(
+            {
+                "name": name,
+                "unit": unit,
+                "std": float(std[i]),
+                "residual_rms": float(rms[i]),
+                "explained": float(explained[i]) if i in explained else None,
+                "corrected": i in large,
+                "decision": text,
+            }
+        )
+    return Correction(function, tuple(large), decisions)
+
+
+def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """Evaluate the linear fit run by run, so that memory stays bounded."""
+    parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
+    return np.concatenate([np.asarray(p) for p in parts])
+
+
+@eqx.filter_jit
+def _apply(model: Any, inputs: Array) -> jax.Array:
+    return jax.vmap(model)(jnp.asarray(inputs))
+
+
+def _target_names(samples: Samples, derivatives: bool) -> Sequence[tuple[str, str]]:
+    if derivatives:
+        return samples.derivative_names
+    return [(c.name, c.unit) for c in samples.signals.outputs]
+
+
+def destabilised(model: DFSM) -> str | None:
+    """Tell whether the corrective function of the derivatives makes an operating point unstable.
+
+    Parameters
+    ----------
+    model
+        Its linear fit is stable.
+
+    Returns
+    -------
+    str or None
+        What would go wrong, for the user; None where nothing does.
+    """
+    if model.e is None:
+        return None
+    worst, where = -np.inf, 0.0
+    for value, point in zip(model.region.grid, model.region.operating, strict=True):
+        A = model.jacobians(*model.split(point))[0]
+        growth = float(np.linalg.eigvals(A).real.max())
+        if growth > worst:
+            worst, where = growth, float(value)
+    if worst <= 0:
+        return None
+    place = f" at {model.schedule} = {where:.4g}" if model.schedule else ""
+    return f"with a correction the model would be unstable{place} (growth {worst:.2g} 1/s)"
