@@ -225,6 +225,31 @@ def simulate(
     _exit_if_ended([result], quiet or as_json)
 
 
+@app.command()
+def wind(
+    field: Annotated[Path, typer.Argument(help="TurbSim field (.bts) that drove the runs.")],
+    files: Files,
+    radius: Annotated[float, typer.Option(help="Rotor radius in m.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the new files.")],
+    quiet: Quiet = False,
+) -> None:
+    """Add the wind over the rotor disk and its slopes to runs: the disturbances to fit with."""
+    from dfsm.files import check_file
+    from dfsm.read import read_all, read_turbsim, with_field_wind, write_table
+
+    source = read_turbsim(field)
+    with _working(quiet):
+        runs = read_all(files)
+        output.mkdir(parents=True, exist_ok=True)
+        targets = [output / f"{run.name}.parquet" for run in runs]
+        for target in targets:
+            check_file(target, [run.source for run in runs])
+        added = [with_field_wind(run, source, radius) for run in runs]
+    for run, target in zip(added, targets, strict=True):
+        write_table(run, target)
+        _say(f"wrote {target} with RotWind, RotShearV and RotShearH", quiet)
+
+
 def main() -> None:
     """Run the command line; the only place that turns errors into exit codes."""
     warnings.showwarning = _show_warning

@@ -15,20 +15,25 @@ from dfsm.read.assemble import existing_file
 from dfsm.read.info import ChannelInfo, RunInfo, describe, gap_warning
 from dfsm.read.openfast import read_openfast
 from dfsm.read.tables import read_table, write_table
+from dfsm.read.turbsim import WindField, disk_wind, read_turbsim, with_field_wind
 from dfsm.read.wind import undisturbed_rotor_wind, wind_warning
 from dfsm.trajectory import Trajectory
 
 __all__ = [
     "ChannelInfo",
     "RunInfo",
+    "WindField",
     "describe",
+    "disk_wind",
     "gap_warning",
     "read",
     "read_all",
     "read_openfast",
     "read_table",
+    "read_turbsim",
     "undisturbed_rotor_wind",
     "wind_warning",
+    "with_field_wind",
     "with_wall_times",
     "write_table",
 ]

@@ -1,0 +1,151 @@
+"""TurbSim fields against planes that are known, and against the run that a real field drove."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import Dfsm
+from dfsm.errors import DfsmError
+from dfsm.read import disk_wind, read, read_turbsim, with_field_wind, write_table
+from dfsm.trajectory import Channel, Trajectory
+
+RADIUS, HUB, DY, NY, NZ, COUNT, DT = 50.0, 90.0, 10.0, 13, 14, 40, 0.5
+REAL = Path(__file__).parents[1] / "examples" / "iea15" / "iea15_2dof_12mps_s08"
+
+
+def planes() -> np.ndarray:
+    """Average and slopes over time, shape (time, 3)."""
+    t = DT * np.arange(COUNT)
+    return np.stack([10 + np.sin(t), 0.5 * np.cos(2 * t), 0.3 * np.sin(3 * t)], axis=1)
+
+
+def field_file(path: Path, kind: int = 7, towers: int = 2, **changes) -> Path:
+    """Write planes (and other components that must not matter) as a TurbSim field."""
+    y, z = (np.arange(NY) - (NY - 1) / 2) * DY, 25 + DY * np.arange(NZ)
+    up, side = np.meshgrid((z - HUB) / RADIUS, y / RADIUS, indexing="ij")
+    a, b, c = planes().T[:, :, None, None]
+    rng = np.random.default_rng(0)
+    wind = rng.normal(size=(COUNT, NZ, NY, 3))
+    wind[..., 0] = a + b * up + c * side
+    slope, offset = 3000.0, -30000.0
+    codes = np.concatenate(
+        [wind.reshape(COUNT, -1), rng.normal(size=(COUNT, 3 * towers))], axis=1
+    ) * np.tile([slope, 100.0, 100.0], NZ * NY + towers)
+    codes += np.tile([offset, 0.0, 0.0], NZ * NY + towers)
+    text = b"made by a test"
+    header = {"kind": kind, "nz": NZ, "ny": NY, "towers": towers, "count": COUNT} | changes
+    head = struct.pack("<h4i", *header.values())
+    head += struct.pack("<6f", DY, DY, DT, 10.0, HUB, 25.0)
+    head += struct.pack("<6fi", slope, offset, 100.0, 0.0, 100.0, 0.0, len(text)) + text
+    path.write_bytes(head + codes.round().astype("<i2").tobytes())
+    return path
+
+
+def run_until(stop: float, start: float = 0.0) -> Trajectory:
+    time = np.arange(start, stop, 0.25)
+    return Trajectory(time, np.sin(time)[:, None], (Channel("q", "m"),), name="run")
+
+
+def test_planes_are_found(tmp_path):
+    field = read_turbsim(field_file(tmp_path / "f.bts"))
+    assert (field.step, field.count, field.mean_wind) == (DT, COUNT, 10.0)
+    assert (field.hub_height, field.periodic, field.towers) == (HUB, False, 2)
+    assert field.delay == pytest.approx(NY // 2 * DY / 10)
+    # The codes round u to 1/3000 m/s.
+    np.testing.assert_allclose(disk_wind(field, RADIUS), planes(), atol=2e-4)
+
+
+def test_a_real_field_gives_the_wind_of_the_run_that_it_drove():
+    run = read(REAL.with_suffix(".parquet")).window(0.0, 11.0)
+    names = ["RotWind", "RotShearV", "RotShearH"]
+    bare = run.select(n for n in run.names if n not in names)
+    found = with_field_wind(bare, read_turbsim(REAL.with_suffix(".bts")), 120.0)
+    for name in names:
+        assert np.abs(found[name] - run[name]).max() < 3e-4, name  # steps of about 1e-4 m/s
+        assert found.channel(name).unit == run.channel(name).unit
+    np.testing.assert_array_equal(found.values[:, :-3], bare.values)
+
+
+@pytest.mark.parametrize("kind", [7, 8])
+def test_the_field_is_ahead_by_half_its_width(tmp_path, kind):
+    field = read_turbsim(field_file(tmp_path / "f.bts", kind))
+    run = with_field_wind(run_until(13.0), field, RADIUS)
+    mesh = DT * np.arange(COUNT) - 6.0
+    np.testing.assert_allclose(
+        run["RotShearV"], np.interp(run.time, mesh, planes()[:, 1]), atol=2e-4
+    )
+
+
+def test_a_periodic_field_repeats_itself_and_another_ends(tmp_path):
+    run = run_until(45.0)
+    found = with_field_wind(run, read_turbsim(field_file(tmp_path / "p.bts", 8)), RADIUS)
+    np.testing.assert_allclose(found["RotWind"][:60], found["RotWind"][80:140], atol=1e-9)
+    with pytest.raises(DfsmError, match=r"covers 0 to 44\.75 s, but .*f\.bts only -6 to 13\.5 s"):
+        with_field_wind(run, read_turbsim(field_file(tmp_path / "f.bts")), RADIUS)
+
+
+def test_channels_are_not_added_twice(tmp_path):
+    field = read_turbsim(field_file(tmp_path / "f.bts"))
+    run = with_field_wind(run_until(5.0), field, RADIUS)
+    with pytest.raises(DfsmError, match="channel 'RotWind' exists already: nothing was added"):
+        with_field_wind(run, field, RADIUS)
+
+
+@pytest.mark.parametrize(
+    ("radius", "said"),
+    [
+        (-1.0, "the rotor radius is -1"),
+        (np.nan, "the rotor radius is nan"),
+        (70.0, "a rotor of radius 70 m reaches beyond the field, which covers 60 m"),
+        (12.0, "only 6 grid points lie on a rotor of radius 12 m, at least 9"),
+    ],
+)
+def test_a_radius_that_does_not_fit(tmp_path, radius, said):
+    # The hub is half a step off the grid's rows: the smallest disks hold few points.
+    field = read_turbsim(field_file(tmp_path / "f.bts"))
+    with pytest.raises(DfsmError, match=said):
+        disk_wind(field, radius)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"kind": 3}, "is no TurbSim full-field file"),
+        ({"nz": 0}, "the header of the wind field makes no sense"),
+        ({"count": COUNT + 1}, r"its header announces \d+: the file is cut off"),
+    ],
+)
+def test_damaged_fields(tmp_path, change, said):
+    with pytest.raises(DfsmError, match=said):
+        read_turbsim(field_file(tmp_path / "f.bts", **change))
+
+
+def test_a_file_too_short_for_a_header(tmp_path):
+    (tmp_path / "f.bts").write_bytes(b"\x07\x00")
+    with pytest.raises(DfsmError, match="is no TurbSim full-field file"):
+        read_turbsim(tmp_path / "f.bts")
+
+
+def test_the_command_adds_the_wind_to_runs(tmp_path, dfsm: Dfsm):
+    field = field_file(tmp_path / "f.bts")
+    write_table(run_until(5.0), tmp_path / "run.csv")
+    result = dfsm("wind", field, tmp_path / "run.csv", "--radius", RADIUS, "-o", tmp_path / "new")
+    assert result.code == 0
+    found = read(tmp_path / "new" / "run.parquet")
+    assert found.names == ("q", "RotWind", "RotShearV", "RotShearH")
+    expected = with_field_wind(run_until(5.0), read_turbsim(field), RADIUS)
+    np.testing.assert_allclose(found.values, expected.values, atol=1e-12)
+
+
+def test_the_command_does_not_overwrite_what_it_reads(tmp_path, dfsm: Dfsm):
+    field = field_file(tmp_path / "f.bts")
+    write_table(run_until(5.0), tmp_path / "run.parquet")
+    before = (tmp_path / "run.parquet").read_bytes()
+    result = dfsm("wind", field, tmp_path / "run.parquet", "--radius", RADIUS, "-o", tmp_path)
+    assert result.code == 2
+    assert "is one of the files to read" in result.err
+    assert (tmp_path / "run.parquet").read_bytes() == before
