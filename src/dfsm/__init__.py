@@ -22,7 +22,14 @@ if TYPE_CHECKING:
     from dfsm.linear import LPV, LTI
     from dfsm.model import DFSM
     from dfsm.progress import show_progress
-    from dfsm.read import describe, read, read_all, write_table
+    from dfsm.read import (
+        describe,
+        read,
+        read_all,
+        read_turbsim,
+        with_field_wind,
+        write_table,
+    )
     from dfsm.report import write_report
     from dfsm.samples import FitSettings
     from dfsm.signals import Azimuth
@@ -50,6 +57,8 @@ _HOME = {
     "read_all": "read",
     "write_table": "read",
     "describe": "read",
+    "read_turbsim": "read",
+    "with_field_wind": "read",
     "RandomKnots": "excitation",
     "RandomSteps": "excitation",
     "Multisine": "excitation",
