@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import islice, pairwise
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from dfsm.corrective.functions import Perceptron
-from dfsm.corrective.levenberg_marquardt import Network, Step, levenberg_marquardt
+from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
+from dfsm.corrective.network import NetworkError, Sizes, evaluate, layers
 from dfsm.corrective.training import CorrectiveFit, TrainingSet
 from dfsm.progress import track
 from dfsm.settings import require, settings
 from dfsm.types import Array
-
-Layers = tuple[tuple[jax.Array, jax.Array], ...]
 
 # Steps without progress on the held-out runs after which training stops.
 _PATIENCE = 10
@@ -63,34 +60,29 @@ def fit_mlp(data: TrainingSet, choice: MLP, seed: int) -> CorrectiveFit:
     last = data.folds == data.folds.max()
     train, held = data.subset(~last), data.subset(last)
     sizes = (data.z.shape[1], *choice.hidden, data.targets.shape[1])
-    start, unravel = ravel_pytree(_start(sizes, seed))
 
-    def network(w: jax.Array, z: jax.Array) -> jax.Array:
-        return _forward(unravel(w), z)
+    def held_error(w: Array) -> Array:
+        predicted = evaluate(jnp.asarray(w), jnp.asarray(held.z), sizes)
+        return np.mean((np.asarray(predicted) - held.targets) ** 2, axis=0)
 
-    @jax.jit
-    def held_error(w: Array) -> jax.Array:
-        predicted = jax.vmap(network, (None, 0))(jnp.asarray(w), jnp.asarray(held.z))
-        return jnp.mean((predicted - jnp.asarray(held.targets)) ** 2, axis=0)
-
-    best, error, taken = Step(np.asarray(start)), np.asarray(held_error(np.asarray(start))), 0
-    for count, step in _steps(network, best, train, choice, choice.iterations):
-        now = np.asarray(held_error(step.weights))
+    best, taken = Step(_start(sizes, seed)), 0
+    error = held_error(best.weights)
+    for count, step in _steps(sizes, best, train, choice, choice.iterations):
+        now = held_error(step.weights)
         if now.sum() < error.sum():
             best, error, taken = step, now, count
         elif count - taken >= _PATIENCE:
             break
     final = best
-    for _, step in _steps(network, best, data, choice, round(_POLISH * taken)):
+    for _, step in _steps(sizes, best, data, choice, round(_POLISH * taken)):
         final = step
-    layers = unravel(jnp.asarray(final.weights))
-    scale = jnp.asarray(data.target_scale)
-    W, b = layers[-1]
+    *hidden, last_layer = layers(jnp.asarray(final.weights), sizes)
+    matrices = (*hidden, last_layer * jnp.asarray(data.target_scale)[:, None])
     function = Perceptron(
         shift=jnp.asarray(data.shift),
         scale=jnp.asarray(data.scale),
-        weights=(*(W for W, _ in layers[:-1]), W * scale[:, None]),
-        biases=(*(b for _, b in layers[:-1]), b * scale),
+        weights=tuple(M[:, :-1] for M in matrices),
+        biases=tuple(M[:, -1] for M in matrices),
     )
     return CorrectiveFit(
         function=function,
@@ -99,26 +91,20 @@ def fit_mlp(data: TrainingSet, choice: MLP, seed: int) -> CorrectiveFit:
     )
 
 
-def _start(sizes: Sequence[int], seed: int) -> Layers:
+def _start(sizes: Sizes, seed: int) -> Array:
     """Random hidden layers under an output of zero: the first step is a linear fit to them."""
     rng = np.random.default_rng(seed)
     hidden = [
-        (jnp.asarray(rng.normal(size=(o, i)) / np.sqrt(i)), jnp.asarray(rng.normal(0, 0.5, o)))
+        np.column_stack([rng.normal(size=(o, i)) / np.sqrt(i), rng.normal(0, 0.5, o)]).ravel()
         for i, o in pairwise(sizes[:-1])
     ]
-    return (*hidden, (jnp.zeros((sizes[-1], sizes[-2])), jnp.zeros(sizes[-1])))
+    return np.concatenate([*hidden, np.zeros(sizes[-1] * (sizes[-2] + 1))])
 
 
 def _steps(
-    network: Network, start: Step, data: TrainingSet, choice: MLP, limit: int
+    sizes: Sizes, start: Step, data: TrainingSet, choice: MLP, limit: int
 ) -> Iterator[tuple[int, Step]]:
     """At most `limit` training steps, counted from 1, with a progress bar."""
-    steps = levenberg_marquardt(network, start, data.z, data.targets, choice.weight_decay)
+    problem = NetworkError.of(sizes, data.z, data.targets)
+    steps = levenberg_marquardt(problem, start, choice.weight_decay * len(data.z))
     yield from enumerate(track(islice(steps, limit), "training", limit), start=1)
-
-
-def _forward(layers: Layers, z: jax.Array) -> jax.Array:
-    for W, b in layers[:-1]:
-        z = jnp.tanh(W @ z + b)
-    W, b = layers[-1]
-    return W @ z + b
