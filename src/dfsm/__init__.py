@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.errors import DfsmError, DfsmWarning
     from dfsm.excitation import Chirp, Multisine, RandomKnots, RandomSteps, Uniform, excite
+    from dfsm.features import Feature
     from dfsm.fit import FitResult, fit
     from dfsm.linear import LPV, LTI
     from dfsm.model import DFSM
@@ -73,6 +74,7 @@ _HOME = {
     "Filter": "derivatives",
     "DerivativeSettings": "derivatives",
     "differentiate": "derivatives",
+    "Feature": "features",
     "LTI": "linear",
     "LPV": "linear",
     "RBF": "corrective",

@@ -12,6 +12,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
 from dfsm.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.errors import DfsmError, near_matches
+from dfsm.features import Feature
 from dfsm.linear import LPV, LTI
 from dfsm.read import read_all
 from dfsm.samples import FitSettings
@@ -48,6 +49,7 @@ class SignalConfig(_Strict):
     states: list[StateSpec]
     controls: list[str] = []
     disturbances: list[str] = []
+    features: list[Feature] = []
     parameters: list[str] = []
     outputs: list[str] = []
 
@@ -74,6 +76,7 @@ class Config(_Strict):
             states=tuple(s.states),
             controls=tuple(s.controls),
             disturbances=tuple(s.disturbances),
+            features=tuple(s.features),
             parameters=tuple(s.parameters),
             outputs=tuple(s.outputs),
             start=self.data.start,

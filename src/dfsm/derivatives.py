@@ -156,7 +156,7 @@ def state_units(states: Sequence[StateSpec], trajectory: Trajectory) -> tuple[st
         A channel that the run does not have.
     """
     units = [trajectory.channel(s.name).unit for s in states]
-    rates = [_per_second(u) for s, u in zip(states, units, strict=True) if s.order == 2]
+    rates = [per_second(u) for s, u in zip(states, units, strict=True) if s.order == 2]
     return (*units, *rates)
 
 
@@ -229,7 +229,7 @@ def differentiate(
             *(f"{s.name}_dot" for s in states),
             *(f"{states[i].name}_ddot" for i in second),
         ),
-        derivative_units=tuple(_per_second(u) for u in state_units(states, trajectory)),
+        derivative_units=tuple(per_second(u) for u in state_units(states, trajectory)),
         noise_std=(*(f.noise_std for f in found), *(None for _ in second)),
     )
 
@@ -314,7 +314,7 @@ def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None
     unit, given = run.channel(spec.name).unit, run.channel(name).unit
     wanted = unit
     for _ in range(times):
-        wanted = _per_second(wanted)
+        wanted = per_second(wanted)
     if unit and given and _time_power(given) != _time_power(wanted):
         raise DfsmError(
             f"{run.where}: channel '{name}' in '{given}' is not the "
@@ -323,7 +323,7 @@ def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None
         )
 
 
-def _per_second(unit: str) -> str:
+def per_second(unit: str) -> str:
     """Append one ``/s``: deg → deg/s → deg/s^2; no unit stays no unit."""
     if not unit:
         return ""

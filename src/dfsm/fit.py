@@ -137,7 +137,7 @@ def _fit_derivatives(samples: Samples, choices: FitSettings) -> LinearFit:
     known = kinematic_rows(choices.states)
     fitted = [i for i in range(samples.derivatives.shape[1]) if i not in known]
     result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], choices)
-    n_uw = len(choices.controls) + len(choices.disturbances)
+    n_uw = len(choices.controls) + len(choices.driving)
     if choices.linear.margin is not None:
         columns = slice(n_uw, n_uw + samples.derivatives.shape[1])
         before = result.residual_rms

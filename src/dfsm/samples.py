@@ -17,6 +17,7 @@ from dfsm.derivatives import (
     state_units,
 )
 from dfsm.errors import DfsmError
+from dfsm.features import Feature
 from dfsm.linear import LPV, LTI
 from dfsm.progress import track
 from dfsm.read import gap_warning, wind_warning
@@ -27,7 +28,7 @@ from dfsm.signals import (
     blade_harmonics,
     radians_per_second,
     require_constant,
-    with_corrected_wind,
+    with_computed,
 )
 from dfsm.trajectory import Channel, Dataset, Role, Trajectory
 from dfsm.types import Array, IntArray
@@ -60,6 +61,8 @@ class FitSettings:
     hub_height
         In m; adds the channel ``RtVAvgxhCorr``, the rotor wind without the platform's motion, to
         runs that only have ``RtVAvgxh``.
+    features
+        Disturbances that are computed from others, see `Feature`; they follow those named.
     nonlinear_only
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
@@ -79,12 +82,18 @@ class FitSettings:
     gate: float = 0.01
     azimuth: Azimuth | None = None
     hub_height: float | None = None
+    features: tuple[Feature, ...] = ()
     nonlinear_only: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
         require(self.gate >= 0, "gate", self.gate, "0 or more")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
+
+    @property
+    def driving(self) -> tuple[str, ...]:
+        """Names of all disturbances, the computed ones last."""
+        return (*self.disturbances, *(f.name for f in self.features))
 
     @property
     def roles(self) -> dict[str, Role]:
@@ -99,7 +108,7 @@ class FitSettings:
         groups: tuple[tuple[Role, Iterable[str]], ...] = (
             ("state", [n for s in self.states for n in s.channels]),
             ("control", self.controls),
-            ("disturbance", self.disturbances),
+            ("disturbance", self.driving),
             ("parameter", self.parameters),
             ("output", self.outputs),
         )
@@ -112,6 +121,14 @@ class FitSettings:
                         f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
                     )
                 roles.setdefault(name, role)
+        for feature in self.features:
+            role = roles.get(feature.source, "disturbance")
+            if role != "disturbance":
+                raise DfsmError(
+                    f"feature '{feature.name}' is made of the {role} '{feature.source}', but a "
+                    "rollout may know no responses and an optimiser must be free to choose "
+                    "controls: make features of disturbances only"
+                )
         return roles
 
 
@@ -155,14 +172,14 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
     names = dict.fromkeys(roles)
     if choices.azimuth is not None and choices.azimuth.angle is not None:
         names[choices.azimuth.angle] = None
-    runs = [with_corrected_wind(r, choices.hub_height) for r in runs]
+    runs = [with_computed(r, choices.hub_height, choices.features) for r in runs]
     picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
     for run in picked:
         run.window(choices.start, choices.stop)
     data = Dataset(picked)
     for name in names:
         data.channel(name)
-    for name in (*choices.controls, *choices.disturbances):
+    for name in (*choices.controls, *choices.driving):
         windows = [r.window(choices.start, choices.stop)[name] for r in data]
         low, high = min(w.min() for w in windows), max(w.max() for w in windows)
         if low == high:
@@ -200,7 +217,7 @@ def extract(data: Dataset, choices: FitSettings) -> Samples:
         whole = found.trajectory
         inside = whole.window(choices.start, choices.stop)
         rows = np.isin(whole.time, inside.time)
-        names = (*choices.controls, *choices.disturbances, *found.names, *choices.parameters)
+        names = (*choices.controls, *choices.driving, *found.names, *choices.parameters)
         parts.append(
             [
                 inside.select(names).values,
@@ -235,13 +252,14 @@ def _signals(data: Dataset, choices: FitSettings) -> SignalTable:
             for n, unit in zip(names, state_units(choices.states, first), strict=True)
         ),
         controls=channels(choices.controls, "control"),
-        disturbances=channels(choices.disturbances, "disturbance"),
+        disturbances=channels(choices.driving, "disturbance"),
         parameters=channels(choices.parameters, "parameter"),
         outputs=channels(choices.outputs, "output"),
         specs=tuple(choices.states),
         derivatives=choices.derivatives,
         azimuth=choices.azimuth,
         hub_height=choices.hub_height,
+        features=choices.features,
     )
     _ = table.azimuth_rate  # fails here, not in the middle of a simulation
     return table

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 import dfsm.jax_setup  # noqa: F401
 from dfsm.derivatives import DerivativeSettings, StateSpec
 from dfsm.errors import DfsmError, near_matches
+from dfsm.features import Feature, with_features
 from dfsm.read.wind import CORRECTED_WIND, undisturbed_rotor_wind
 from dfsm.settings import require, settings
 from dfsm.trajectory import Channel, Trajectory
@@ -67,6 +68,8 @@ class SignalTable:
     hub_height
         In m; where set, runs get the rotor wind corrected for the platform's motion as channel
         ``RtVAvgxhCorr``, see `undisturbed_rotor_wind`.
+    features
+        Disturbances that are computed from others, see `with_features`.
     """
 
     states: tuple[Channel, ...]
@@ -78,6 +81,7 @@ class SignalTable:
     derivatives: DerivativeSettings = field(hash=False)
     azimuth: Azimuth | None = None
     hub_height: float | None = None
+    features: tuple[Feature, ...] = ()
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
@@ -119,11 +123,23 @@ class SignalTable:
         return column, radians_per_second(self.states[column])
 
 
-def with_corrected_wind(run: Trajectory, hub_height: float | None) -> Trajectory:
-    """Add the corrected rotor wind to a run that lacks it, where a hub height is set."""
-    if hub_height is None or CORRECTED_WIND in run:
-        return run
-    return undisturbed_rotor_wind(run, hub_height)
+def with_computed(
+    run: Trajectory, hub_height: float | None, features: Iterable[Feature] = ()
+) -> Trajectory:
+    """Add the channels that are computed from others, the same in training and in use.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    hub_height
+        In m; where set, a run without the corrected rotor wind gets it.
+    features
+        See `with_features`.
+    """
+    if hub_height is not None and CORRECTED_WIND not in run:
+        run = undisturbed_rotor_wind(run, hub_height)
+    return with_features(run, features)
 
 
 def require_constant(run: Trajectory, parameters: Iterable[str]) -> None:

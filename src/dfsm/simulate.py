@@ -20,7 +20,7 @@ from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.integrate import Case, Rollout, adapt, march, mesh_of
 from dfsm.model import DFSM
 from dfsm.settings import settings
-from dfsm.signals import require_constant, with_corrected_wind
+from dfsm.signals import require_constant, with_computed
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 
@@ -193,7 +193,7 @@ def simulate(
     options = options or SimulationSettings()
     single = isinstance(runs, Trajectory)
     batch = [runs] if isinstance(runs, Trajectory) else list(runs)
-    batch = [with_corrected_wind(r, model.signals.hub_height) for r in batch]
+    batch = [with_computed(r, model.signals.hub_height, model.signals.features) for r in batch]
     if not batch:
         raise DfsmError("no runs were given to simulate")
     names = model.signals.exogenous

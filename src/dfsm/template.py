@@ -43,6 +43,9 @@ signals:
   controls: {controls}        # what an optimiser may choose
   # Known signals that nobody chooses. None of them may hold a response of the turbine.{wind_note}
   disturbances: {disturbances}
+  # Disturbances computed from others: a rate, or a first-order lag of so many seconds, as in
+  # [{{source: Wave1Elev, kind: rate}}, {{source: RotWind, kind: lag, time_constant: 10}}]
+  features: []
   parameters: []       # plant variables, constant within a run
   outputs: {outputs}
 

@@ -24,7 +24,7 @@ from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.model import DFSM
 from dfsm.progress import track
-from dfsm.signals import Azimuth, radians_per_second, with_corrected_wind
+from dfsm.signals import Azimuth, radians_per_second, with_computed
 from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
 from dfsm.spectra import Band, spectrum
 from dfsm.trajectory import Trajectory
@@ -72,7 +72,7 @@ def validate(
     if isinstance(models, DFSM):
         models = compared(models)
     first = next(iter(models.values()))
-    runs = [with_corrected_wind(r, first.signals.hub_height) for r in runs]
+    runs = [with_computed(r, first.signals.hub_height, first.signals.features) for r in runs]
     if not runs:
         raise DfsmError("no test runs were given, at least one is needed")
     for run in runs:
