@@ -1,6 +1,6 @@
 """Run the measurements and print one JSON object.
 
-python -m benchmarks [derivatives] [accuracy] [speed]
+python -m benchmarks [derivatives] [accuracy] [speed] [parameters]
 """
 
 from __future__ import annotations
@@ -12,10 +12,15 @@ import platform
 import warnings
 
 import dfsm
-from benchmarks import accuracy, derivatives, speed
+from benchmarks import accuracy, derivatives, parameters, speed
 from dfsm.files import json_value
 
-PARTS = {"derivatives": derivatives.run, "accuracy": accuracy.run, "speed": speed.run}
+PARTS = {
+    "derivatives": derivatives.run,
+    "accuracy": accuracy.run,
+    "speed": speed.run,
+    "parameters": parameters.run,
+}
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Write the tables of the README from measurements.
+"""Write the tables of the README and of docs/method.md from measurements.
 
 python -m benchmarks > figures.json && python -m benchmarks.readme figures.json
 """
@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+FILES = (ROOT / "README.md", ROOT / "docs" / "method.md")
 
 
 def accuracy_table(figures: Mapping[str, Any], variant: str = "multi-fidelity") -> list[str]:
@@ -71,20 +72,42 @@ def derivatives_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-TABLES = {"accuracy": accuracy_table, "speed": speed_table, "derivatives": derivatives_table}
+def parameters_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors of the derivative and of the rollout for three sets of masses."""
+    sets = next(iter(figures["errors"].values()))
+    heads = [f"{where}, f̂ / rollout" for where in sets]
+    lines = [f"| model | {' | '.join(heads)} |", "|---|" + "---|" * len(heads)]
+    for name, found in figures["errors"].items():
+        cells = [
+            f"{100 * e['derivative']:.2g} % / "
+            + ("–" if e["rollout"] is None else f"{100 * e['rollout']:.2g} %")
+            for e in found.values()
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+TABLES = {
+    "accuracy": accuracy_table,
+    "speed": speed_table,
+    "derivatives": derivatives_table,
+    "parameters": parameters_table,
+}
 
 
 def main() -> None:
     """Replace what stands between ``<!-- name -->`` and ``<!-- end -->``."""
     figures = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    text = README.read_text(encoding="utf-8")
-    for name, table in TABLES.items():
-        if name in figures:
-            head, rest = text.split(f"<!-- {name} -->", 1)
-            tail = rest.split("<!-- end -->", 1)[1]
-            lines = "\n".join(table(figures[name]))
-            text = f"{head}<!-- {name} -->\n{lines}\n<!-- end -->{tail}"
-    README.write_text(text, encoding="utf-8")
+    for path in FILES:
+        text = path.read_text(encoding="utf-8")
+        for name, table in TABLES.items():
+            mark = f"<!-- {name} -->"
+            if name in figures and mark in text:
+                head, rest = text.split(mark, 1)
+                tail = rest.split("<!-- end -->", 1)[1]
+                lines = "\n".join(table(figures[name]))
+                text = f"{head}{mark}\n{lines}\n<!-- end -->{tail}"
+        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

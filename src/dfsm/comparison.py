@@ -94,11 +94,14 @@ class RunComparison:
         Of the recorded channels.
     models
         By model name.
+    parameters
+        Values of the models' parameters in this run, in the channels' units.
     """
 
     recorded: Trajectory
     statistics: Mapping[str, ChannelStatistics]
     models: Mapping[str, ModelRun]
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,7 @@ def _run_dict(run: RunComparison) -> dict[str, Any]:
         "name": run.recorded.name,
         "duration_s": run.recorded.duration,
         "simulator_wall_time_s": run.recorded.wall_time,
+        "parameters": dict(run.parameters),
         "statistics": statistics(run.statistics),
         "models": {
             name: {

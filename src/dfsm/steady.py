@@ -20,7 +20,7 @@ class SteadyState:
 
     Attributes
     ----------
-    states, controls, disturbances, outputs
+    states, controls, disturbances, parameters, outputs
         Values in the model's units, shapes ``(n,)``.
     eigenvalues
         Of the exact Jacobian A there, in 1/s.
@@ -35,6 +35,7 @@ class SteadyState:
     states: Array
     controls: Array
     disturbances: Array
+    parameters: Array
     outputs: Array
     eigenvalues: ComplexArray
     residual: float
@@ -47,6 +48,7 @@ def steady_state(
     schedule: float | None = None,
     controls: ArrayLike | None = None,
     disturbances: ArrayLike | None = None,
+    parameters: ArrayLike | None = None,
 ) -> SteadyState:
     """Find the states at which nothing changes, for inputs held constant.
 
@@ -56,7 +58,7 @@ def steady_state(
         The surrogate.
     schedule
         Value of the scheduling signal (e.g. wind speed); needed for an LPV model.
-    controls, disturbances
+    controls, disturbances, parameters
         Values to hold, shapes ``(n,)``; by default the mean of the training runs at that
         schedule value, in which the schedule itself is replaced.
 
@@ -74,6 +76,7 @@ def steady_state(
     x, u, w, p = model.split(start)
     u = u if controls is None else jnp.asarray(controls, dtype=float)
     w = w if disturbances is None else jnp.asarray(disturbances, dtype=float)
+    p = p if parameters is None else jnp.asarray(parameters, dtype=float)
     n_uw = len(model.signals.controls) + len(model.signals.disturbances)
     scale = model.region.std[n_uw : n_uw + x.size]
 
@@ -98,6 +101,7 @@ def steady_state(
         states=np.asarray(states),
         controls=np.asarray(u),
         disturbances=np.asarray(w),
+        parameters=np.asarray(p),
         outputs=np.asarray(model.output(states, u, w, p)),
         eigenvalues=eigenvalues[np.argsort(-eigenvalues.real)],
         residual=worst,

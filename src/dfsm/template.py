@@ -46,7 +46,7 @@ signals:
   # Disturbances computed from others: a rate, or a first-order lag of so many seconds, as in
   # [{{source: Wave1Elev, kind: rate}}, {{source: RotWind, kind: lag, time_constant: 10}}]
   features: []
-  parameters: []       # plant variables, constant within a run
+  parameters: {parameters}       # plant variables, constant within a run
   outputs: {outputs}
 
 derivatives:
@@ -93,11 +93,10 @@ def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
     """Fill the template with channels that all runs share."""
     first = describe(runs[0])
     common = set(runs[0].names).intersection(*(r.names for r in runs))
-    varying = {
-        c.name: c
-        for c in first.channels
-        if c.name in common and any(r[c.name].min() < r[c.name].max() for r in runs)
-    }
+    shared = {c.name: c for c in first.channels if c.name in common}
+    varying = {n: c for n, c in shared.items() if any(r[n].min() < r[n].max() for r in runs)}
+    parameters = [n for n in shared if n not in varying and _differs(n, runs)]
+    listed = [c for n, c in shared.items() if n in varying or n in parameters]
     wind = next((w for w in _WINDS if w in varying), None)
     states = [s for s in _STATES if s in varying]
     states = states[:-1] if {"GenSpeed", "RotSpeed"} <= set(states) else states
@@ -109,18 +108,25 @@ def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
         train=_block(train),
         start=_TRANSIENT if long else "null",
         hub_height="null",
-        constant="" if len(varying) == len(first.channels) else "; constant ones left out",
-        channels="\n".join(_comment(c) for c in varying.values()),
+        constant="" if len(listed) == len(first.channels) else "; constant ones left out",
+        channels="\n".join(_comment(c) for c in listed),
         states=_block([{"name": s, "order": 2} for s in states]),
         controls=_flow([c for c in _CONTROLS if c in varying]),
         wind_note=_WIND_NOTE if relative else "",
         disturbances=_flow(disturbances),
+        parameters=_flow(parameters),
         outputs=_flow([o for o in _OUTPUTS if o in varying]),
         linear=(
             _LPV.format(schedule=_flow(wind), margin=_MARGIN) if wind else "  kind: LTI\n" + _MARGIN
         ),
         azimuth=_azimuth(states, varying),
     )
+
+
+def _differs(name: str, runs: Sequence[Trajectory]) -> bool:
+    """Whether a channel that is constant in every run is not the same in all of them."""
+    starts = [r[name][0] for r in runs]
+    return all(r[name].min() == r[name].max() for r in runs) and min(starts) < max(starts)
 
 
 _WIND_NOTE = """

@@ -139,7 +139,12 @@ def _compare(
             statistics=statistics,
             derivative_errors=_derivative_errors(first, predicted, found.derivatives[rows]),
         )
-    return RunComparison(recorded, _all_statistics(recorded, bands, s.names("outputs")), results)
+    return RunComparison(
+        recorded=recorded,
+        statistics=_all_statistics(recorded, bands, s.names("outputs")),
+        models=results,
+        parameters={name: float(inside[name][0]) for name in s.names("parameters")},
+    )
 
 
 def _simulate_warm(

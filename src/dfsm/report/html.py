@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 from collections.abc import Callable, Mapping
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from dfsm.errors import DfsmError
-from dfsm.files import write_file
 from dfsm.report import runs as by_run
 from dfsm.report import sections
+from dfsm.report.document import document, write_document
 from dfsm.report.elements import Markup, element, join, plural
 from dfsm.report.figures import page_data
 from dfsm.validate import RunComparison, Validation
@@ -25,7 +19,6 @@ _ERRORS_NOTE = (
     "(one that completed none is left out); the "
     "outermost bins hold what lies beyond."
 )
-_ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
 def write_report(
@@ -52,59 +45,12 @@ def write_report(
     """
     if not validations:
         raise DfsmError("no validations were given, a report needs at least one")
-    text = _page(validations, title)
-    with write_file(path) as temporary:
-        # File names may hold bytes that are no text.
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+    write_document(_page(validations, title), path)
 
 
 def _page(validations: Mapping[str, Validation], title: str) -> str:
-    from plotly.offline import get_plotlyjs
-
-    own = files("dfsm.report")
-    scripts = [get_plotlyjs(), (own / "page.js").read_text(encoding="utf-8")]
-    css = (own / "page.css").read_text(encoding="utf-8")
-    data = embed(page_data(validations))
     body = join(_header(validations, title), _main(validations))
-    return "\n".join(
-        [
-            "<!DOCTYPE html>",
-            '<html lang="en">',
-            "<head>",
-            '<meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{_policy(scripts)}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<meta name="color-scheme" content="light dark">',
-            f"<title>{escape(title)}</title>",
-            f"<style>{css}</style>",
-            "</head>",
-            f"<body>{body}",
-            f'<script type="application/json" id="data">{data}</script>',
-            *[f"<script>{s}</script>" for s in scripts],
-            "</body>",
-            "</html>",
-            "",
-        ]
-    )
-
-
-def embed(data: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
-    text = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    return text.translate(_ESCAPES)
-
-
-def _policy(scripts: list[str]) -> str:
-    """Let nothing run but these scripts, and nothing be fetched.
-
-    Escaping already keeps data from becoming code; should it ever fail, the browser refuses.
-    """
-    hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
-    allowed = " ".join(f"'sha256-{h}'" for h in hashes)
-    return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
-        "img-src data: blob:; base-uri 'none'; form-action 'none'"
-    )
+    return document(title, body, page_data(validations), script="page.js")
 
 
 # -- layout -------------------------------------------------------------------------------------
@@ -115,8 +61,8 @@ def _header(validations: Mapping[str, Validation], title: str) -> Markup:
     models = plural(len(validations), "fitted model")
     lede = (
         f"{models}, {plural(len(names), 'test run')}. Every model variant is simulated from the "
-        "recorded initial state with the recorded controls and disturbances of each test run, and "
-        "its states and outputs are compared with the recorded ones along its own rollout. Figures "
+        "recorded initial state with the recorded inputs of each test run, and its states and "
+        "outputs are compared with the recorded ones along its own rollout. Figures "
         "in the tables come from all samples; the curves are thinned to about 5 Hz for display."
     )
     return element("header", element("h1", title), element("p", lede, cls="lede"))

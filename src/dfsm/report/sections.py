@@ -322,12 +322,18 @@ def provenance(name: str, validation: Validation) -> Markup:
         for d in record.get("data", ())
     ]
     versions = [[k, str(v)] for k, v in record.get("versions", {}).items()]
+    parameters = next(iter(validation.models.values())).signals.parameters
     tests = [[r.recorded.name, r.recorded.source or MISSING, Markup(len(r.recorded)),
-              r.recorded.wall_time] for r in validation.runs]  # fmt: skip
+              r.recorded.wall_time, *(r.parameters[c.name] for c in parameters)]
+             for r in validation.runs]  # fmt: skip
     parts = [
         ("Settings", ["Setting", "Value"], settings),
         ("Training data", ["Run", "Samples", "Seconds", "SHA-256 (first 12)"], data),
-        ("Test runs", ["Run", "File", "Samples", "Simulator's wall time (s)"], tests),
+        (
+            "Test runs",
+            ["Run", "File", "Samples", "Simulator's wall time (s)", *(c.label for c in parameters)],
+            tests,
+        ),
         ("Versions", ["Package", "Version"], versions),
     ]
     return join(
