@@ -334,3 +334,21 @@ def test_one_run_is_split_along_its_time():
 def test_more_units_than_samples_is_refused(choice):
     with pytest.raises(DfsmError, match="51 points were asked for but there are only 50 samples"):
         fit_corrective(*data(0, n=50), choice)
+
+
+def test_spread_keeps_what_is_rare():
+    rng = np.random.default_rng(0)
+    X = np.concatenate([rng.normal(0, 0.01, (990, 2)), rng.normal(0, 3.0, (10, 2))])
+    Y, runs = X.sum(1, keepdims=True), np.sort(np.arange(1000) % 5)
+    training = TrainingSet.build(X, Y, runs)
+    kept = training.spread(50, 0)
+    assert len(kept.z) == 50
+    far = np.abs(training.thinned(150).z).max(1) > 1
+    assert (np.abs(kept.z).max(1) > 1).sum() == far.sum() > 0
+    np.testing.assert_allclose(
+        kept.targets[:, 0],
+        kept.z @ (training.scale / training.target_scale)
+        + (training.shift.sum() / training.target_scale[0]),
+    )
+    np.testing.assert_array_equal(kept.runs, np.sort(kept.runs))
+    assert len(training.spread(2000, 0).z) == 1000

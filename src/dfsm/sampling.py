@@ -91,7 +91,7 @@ def subsample(inputs: Array, size: int, method: Method = "kmeans", seed: int = 0
     if method == "kmeans":
         points = _kmeans(inputs, size, rng)
     elif method == "maxmin":
-        points = inputs[_maxmin(inputs, size, rng)]
+        points = inputs[maxmin(inputs, size, rng)]
     else:
         points = inputs[np.sort(rng.choice(len(inputs), size, replace=False))]
     labels = nearest(inputs, points)
@@ -128,7 +128,23 @@ def _kmeans(inputs: Array, size: int, rng: np.random.Generator) -> Array:
         return model.fit(inputs).cluster_centers_
 
 
-def _maxmin(inputs: Array, size: int, rng: np.random.Generator) -> IntArray:
+def maxmin(inputs: Array, size: int, rng: np.random.Generator) -> IntArray:
+    """Indices of samples each as far as possible from those before it (Johnson et al. 1990).
+
+    Parameters
+    ----------
+    inputs
+        Standardised samples, shape ``(sample, input)``.
+    size
+        How many, at most all.
+    rng
+        Draws the first.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(size,)``, in the order chosen.
+    """
     chosen = np.empty(size, dtype=np.int64)
     chosen[0] = rng.integers(len(inputs))
     distance = np.full(len(inputs), np.inf)

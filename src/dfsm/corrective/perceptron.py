@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice, pairwise
 from typing import Literal
 
@@ -12,13 +12,15 @@ import numpy as np
 from dfsm.corrective.functions import Perceptron
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
 from dfsm.corrective.network import NetworkError, Sizes, evaluate, layers
-from dfsm.corrective.training import CorrectiveFit, TrainingSet
+from dfsm.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
 from dfsm.progress import track
 from dfsm.settings import require, settings
-from dfsm.types import Array
+from dfsm.types import Array, IntArray
 
 # Steps without progress on the held-out runs after which training stops.
-_PATIENCE = 10
+_PATIENCE = 20
+# Random starts, and steps that each gets to show where it leads.
+_STARTS, _TRIAL = 4, 20
 # Of the steps taken on three quarters of the runs, this share again on all of them.
 _POLISH = 0.5
 
@@ -37,12 +39,12 @@ class MLP:
     weight_decay
         Penalty on the squared weights, per sample of standardised targets.
     samples
-        Samples used for training, evenly thinned: neighbours in time are near copies.
+        Samples used for training, spread over the inputs: neighbours in time are near copies.
     """
 
     kind: Literal["mlp"] = "mlp"
     hidden: tuple[int, ...] = (20, 20)
-    iterations: int = 60
+    iterations: int = 120
     weight_decay: float = 1e-8
     samples: int = 8000
 
@@ -56,25 +58,28 @@ class MLP:
 
 def fit_mlp(data: TrainingSet, choice: MLP, seed: int) -> CorrectiveFit:
     """Train a perceptron; the last fold of the runs decides when to stop."""
-    data = data.thinned(choice.samples)
     last = data.folds == data.folds.max()
-    train, held = data.subset(~last), data.subset(last)
+    held = data.subset(last).thinned(SEARCH_SAMPLES)
+    train = data.subset(~last).spread(choice.samples, seed)
     sizes = (data.z.shape[1], *choice.hidden, data.targets.shape[1])
 
-    def held_error(w: Array) -> Array:
+    def squares(w: Array) -> Array:
         predicted = evaluate(jnp.asarray(w), jnp.asarray(held.z), sizes)
-        return np.mean((np.asarray(predicted) - held.targets) ** 2, axis=0)
+        return (np.asarray(predicted) - held.targets) ** 2
 
-    best, taken = Step(_start(sizes, seed)), 0
-    error = held_error(best.weights)
+    def typical(step: Step) -> float:
+        return _typical(squares(step.weights), held.runs)
+
+    best = _promising(sizes, train, choice, seed, typical)
+    error, taken = typical(best), 0
     for count, step in _steps(sizes, best, train, choice, choice.iterations):
-        now = held_error(step.weights)
-        if now.sum() < error.sum():
+        now = typical(step)
+        if now < error:
             best, error, taken = step, now, count
         elif count - taken >= _PATIENCE:
             break
-    final = best
-    for _, step in _steps(sizes, best, data, choice, round(_POLISH * taken)):
+    final, everything = best, data.spread(choice.samples, seed)
+    for _, step in _steps(sizes, best, everything, choice, round(_POLISH * taken)):
         final = step
     *hidden, last_layer = layers(jnp.asarray(final.weights), sizes)
     matrices = (*hidden, last_layer * jnp.asarray(data.target_scale)[:, None])
@@ -86,9 +91,28 @@ def fit_mlp(data: TrainingSet, choice: MLP, seed: int) -> CorrectiveFit:
     )
     return CorrectiveFit(
         function=function,
-        explained=1 - error / ((held.targets - train.targets.mean(0)) ** 2).mean(0),
+        explained=1 - squares(best.weights).mean(0) / held.targets.var(0),
         detail=f"{'-'.join(map(str, sizes))} tanh network, {taken} training steps",
     )
+
+
+def _promising(
+    sizes: Sizes, train: TrainingSet, choice: MLP, seed: int, error: Callable[[Step], float]
+) -> Step:
+    """Best of a few random starts after a few steps each: some lead nowhere."""
+    found: list[tuple[float, int, Step]] = []
+    for k in range(_STARTS):
+        start = Step(_start(sizes, seed * _STARTS + k))
+        found.append((error(start), len(found), start))
+        for _, step in _steps(sizes, start, train, choice, min(_TRIAL, choice.iterations)):
+            found.append((error(step), len(found), step))
+    return min(found)[2]
+
+
+def _typical(squares: Array, runs: IntArray) -> float:
+    """Geometric mean over runs of their mean squares: one run out of reach does not decide."""
+    means = [squares[runs == run].mean() for run in np.unique(runs)]
+    return float(np.exp(np.mean(np.log(np.maximum(means, np.finfo(float).tiny)))))
 
 
 def _start(sizes: Sizes, seed: int) -> Array:

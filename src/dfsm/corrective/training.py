@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.corrective.functions import Corrective
+from dfsm.sampling import maxmin
 from dfsm.types import Array, IntArray
 
 # Cross-validation and iterative training see at most this many samples, evenly thinned.
 SEARCH_SAMPLES = 12_000
+# Samples that `TrainingSet.spread` chooses from, per sample that it keeps.
+_CANDIDATES = 3
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class TrainingSet:
         Standardised inputs, shape ``(sample, input)``.
     targets
         Residuals scaled to unit variance, shape ``(sample, target)``.
+    runs
+        Run of each sample, shape ``(sample,)``.
     folds
         Cross-validation fold of each sample, shape ``(sample,)``; a run is never split over two
         folds unless there are fewer than two runs.
@@ -54,6 +59,7 @@ class TrainingSet:
 
     z: Array
     targets: Array
+    runs: IntArray
     folds: IntArray
     shift: Array
     scale: Array
@@ -71,22 +77,40 @@ class TrainingSet:
         else:
             folds = (np.arange(len(inputs)) * 4) // len(inputs)
         return cls(
-            (inputs - shift) / scale, targets / target_scale, folds, shift, scale, target_scale
+            (inputs - shift) / scale,
+            targets / target_scale,
+            runs,
+            folds,
+            shift,
+            scale,
+            target_scale,
         )
 
     def thinned(self, size: int) -> TrainingSet:
         """Keep every k-th sample so that at most `size` remain."""
         k = max(1, -(-len(self.z) // size))
-        return replace(self, z=self.z[::k], targets=self.targets[::k], folds=self.folds[::k])
+        return self.subset(np.arange(0, len(self.z), k))
+
+    def spread(self, size: int, seed: int) -> TrainingSet:
+        """Keep at most `size` samples that cover the inputs evenly, rare ones as well as common.
+
+        Max-min points of a thinned copy (Johnson et al. 1990): where a run passes slowly or often
+        its samples are near copies, and what is rare decides how far a network can be trusted.
+        """
+        some = self.thinned(_CANDIDATES * size)
+        if len(some.z) <= size:
+            return some
+        return some.subset(np.sort(maxmin(some.z, size, np.random.default_rng(seed))))
 
     @property
     def typical_distance(self) -> float:
         """Root-mean-square distance between two samples drawn at random."""
         return float(np.sqrt(2 * self.z.var(0).sum()))
 
-    def subset(self, keep: NDArray[np.bool_]) -> TrainingSet:
+    def subset(self, keep: NDArray[np.bool_] | IntArray) -> TrainingSet:
         """Keep some samples under the same standardisation."""
-        return replace(self, z=self.z[keep], targets=self.targets[keep], folds=self.folds[keep])
+        kept = {name: getattr(self, name)[keep] for name in ("z", "targets", "runs", "folds")}
+        return replace(self, **kept)
 
 
 def cross_validated(
