@@ -18,9 +18,9 @@ from dfsm.errors import DfsmError
 from dfsm.fit import fit
 from dfsm.linear import LTI
 from dfsm.report import write_report
+from dfsm.report.document import embed
 from dfsm.report.elements import element, number
 from dfsm.report.figures import thin
-from dfsm.report.html import embed
 from dfsm.samples import FitSettings
 from dfsm.simulate import Status
 from dfsm.trajectory import Channel, Trajectory
