@@ -187,7 +187,7 @@ def test_names_cannot_break_the_config(here, dfsm, name):
     assert parse_config(Path("c.yaml")).data.train == [file]
     assert list(YAML(typ="safe").load(Path("c.yaml"))) == [
         *("data", "signals", "derivatives", "linear", "corrective"),
-        *("gate", "azimuth", "nonlinear_only", "seed"),
+        *("gate", "azimuth", "nonlinear_only", "refine", "seed"),
     ]
     assert names[0] == name
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         with_field_wind,
         write_table,
     )
+    from dfsm.refine import RefineResult, RefineSettings, refine
     from dfsm.report import write_report
     from dfsm.samples import FitSettings
     from dfsm.signals import Azimuth
@@ -89,6 +90,9 @@ _HOME = {
     "FitSettings": "samples",
     "FitResult": "fit",
     "fit": "fit",
+    "RefineSettings": "refine",
+    "RefineResult": "refine",
+    "refine": "refine",
     "save": "storage",
     "load": "storage",
     "load_all": "storage",

@@ -82,22 +82,28 @@ def fit(
     """Fit a multi-fidelity model and save it as a folder."""
     from dfsm.config import load_config
     from dfsm.fit import fit as run_fit
+    from dfsm.refine import refine
     from dfsm.storage import check_target, save
 
     check_target(output)
     with _working(quiet):
         settings, runs = load_config(config)
-        result = run_fit(runs, settings.fit_settings())
+        choices = settings.fit_settings()
+        result = run_fit(runs, choices)
+        model = result.model
+        if settings.refine is not None:
+            window = {"start": choices.start, "stop": choices.stop}
+            model = refine(model, runs, settings.refine, **window, seed=choices.seed).model
     replaced = output.exists() and any(output.iterdir())
-    save(result.model, output, result.nonlinear)
+    save(model, output, result.nonlinear)
     if replaced and not quiet:
         print(printable(f"note: replaced the model that was in {output}"), file=sys.stderr)
     if as_json:
         from dfsm.files import json_value
 
-        _print_json(json_value(dict(result.model.provenance.record)))
+        _print_json(json_value(dict(model.provenance.record)))
         return
-    _say(_lines(result.model.summary()), quiet)
+    _say(_lines(model.summary()), quiet)
     seconds = sum(result.seconds.values())
     _say(
         f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",

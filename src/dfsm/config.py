@@ -15,6 +15,7 @@ from dfsm.errors import DfsmError, near_matches
 from dfsm.features import Feature
 from dfsm.linear import LPV, LTI
 from dfsm.read import read_all
+from dfsm.refine import RefineSettings
 from dfsm.samples import FitSettings
 from dfsm.signals import Azimuth
 from dfsm.trajectory import Trajectory
@@ -67,6 +68,7 @@ class Config(_Strict):
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
+    refine: RefineSettings | None = None
     seed: int = FitSettings.seed
 
     def fit_settings(self) -> FitSettings:

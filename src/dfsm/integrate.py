@@ -185,6 +185,40 @@ def _march(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     model = model.prepared()
 
+    def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
+        return rk4(model, x0, h, v)
+
+    xs = jax.vmap(states)(*map(jnp.asarray, (x0, h, inputs)))
+    seen = _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
+    return xs, *seen
+
+
+def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = np.inf) -> jax.Array:
+    """Classical RK4 over given steps; JAX can follow it.
+
+    Parameters
+    ----------
+    model
+        The surrogate, best `prepared`.
+    x0
+        Initial states ``(state,)``.
+    h
+        Steps in s ``(step,)``; a step of zero changes nothing.
+    v
+        Exogenous inputs at ends and middles of the steps ``(2 step + 1, exogenous)``.
+    bound
+        States are held within this many training half-ranges of the range's middle.
+
+    Returns
+    -------
+    Array
+        States at the ends of all steps, ``(step + 1, state)``.
+    """
+    n_uw = len(model.signals.controls) + len(model.signals.disturbances)
+    columns = slice(n_uw, n_uw + len(model.signals.states))
+    low, high = model.region.low[columns], model.region.high[columns]
+    middle, reach = (low + high) / 2, (high - low) / 2 * bound
+
     def step(x: jax.Array, drive: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         dt, v0, vm, v1 = drive
         k1 = _slope(model, x, v0)
@@ -192,15 +226,12 @@ def _march(
         k3 = _slope(model, x + 0.5 * dt * k2, vm)
         k4 = _slope(model, x + dt * k3, v1)
         x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        if np.isfinite(bound):
+            x = jnp.clip(x, middle - reach, middle + reach)
         return x, x
 
-    def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
-        _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
-        return jnp.concatenate([x0[None], xs])
-
-    xs = jax.vmap(states)(*map(jnp.asarray, (x0, h, inputs)))
-    seen = _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
-    return xs, *seen
+    _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
+    return jnp.concatenate([x0[None], xs])
 
 
 def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -282,6 +282,8 @@ class DFSM(eqx.Module):
             unstable = "  UNSTABLE" if values.real.max() > 0 else ""
             lines.append(f"  eigenvalues (1/s){where}: {listed}{unstable}")
         lines += [f"check: {text}" for text in record.get("checks", [])]
+        if "refinement" in record:
+            lines.append(record["refinement"]["message"])
         lines += [f"warning: {text}" for text in record.get("warnings", [])]
         return "\n".join(lines)
 

@@ -63,6 +63,9 @@ corrective:
 gate: 0.01            # correct a row only if its residual exceeds this share of the signal
 azimuth: {azimuth}
 nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in the report
+# Refine the derivative fit on rollouts over the training runs, for instance
+# refine: {{windows: [20, 100, null], step: 0.25}}
+refine: null
 seed: 0
 """
 

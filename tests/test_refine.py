@@ -1,0 +1,210 @@
+"""Rollout refinement on a system that is known: biased fits are mended, good ones are kept."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+from conftest import changed, write_config
+from dfsm.corrective import GaussianUnits, NoCorrection, Perceptron
+from dfsm.derivatives import StateSpec
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.fit import fit
+from dfsm.linear import LTI
+from dfsm.parametrise import Parametrisation
+from dfsm.refine import RefineSettings, _record, _RolloutError, refine
+from dfsm.samples import FitSettings
+from dfsm.simulate import simulate
+from dfsm.storage import load
+from dfsm.trajectory import Channel, Trajectory
+from systems import OSCILLATOR_A, linear_model, wander
+
+TIME = np.arange(0, 60.01, 0.05)
+SETTINGS = FitSettings(
+    states=(StateSpec(name="q", order=2),),
+    controls=("u",),
+    linear=LTI(),
+    corrective=NoCorrection(),
+    nonlinear_only=False,
+)
+CHOICES = RefineSettings(windows=(5.0, None), step=0.1, iterations=10)
+
+
+def driven(seed: int, hidden: float = 1.0) -> Trajectory:
+    """q'' = -4 q - 0.6 q' + 2 u + w, where w is a force that no channel holds."""
+    rng = np.random.default_rng(seed)
+    u, w = (wander(rng, 0.5, TIME[-1], 2.0)(TIME) for _ in range(2))
+    system = (OSCILLATOR_A, np.array([[0.0, 0.0], [2.0, hidden]]), np.eye(2), np.zeros((2, 2)))
+    q = lsim(system, np.stack([u, w], axis=1), TIME)[1][:, 0]
+    channels = (Channel("q", "m"), Channel("u", "N"))
+    return Trajectory(TIME, np.stack([q, u], axis=1), channels, name=f"run{seed}")
+
+
+def rollout_error(model, run: Trajectory) -> float:
+    found = simulate(model, run).trajectory["q"]
+    return float(np.sqrt(np.mean((found - run["q"][: len(found)]) ** 2)) / run["q"].std())
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[Trajectory]:
+    return [driven(seed) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def biased(runs):
+    """A fit whose damping is wrong, as derivative fits of real data are."""
+    model = fit(runs, SETTINGS).model
+    L = model.f.coefficients.at[0, 1, 2].set(-0.05)
+    return replace(model, f=replace(model.f, coefficients=L))
+
+
+def test_a_biased_fit_is_mended(runs, biased):
+    result = refine(biased, runs, CHOICES)
+    assert result.improved
+    assert result.after < 0.5 * result.before
+    damping = float(result.model.f.coefficients[0, 1, 2])
+    assert damping == pytest.approx(-0.6, abs=0.15)
+    test = driven(99)
+    assert rollout_error(result.model, test) < 0.8 * rollout_error(biased, test)
+    # Kinematic rows are laws, not parameters.
+    np.testing.assert_array_equal(result.model.f.coefficients[0, 0], biased.f.coefficients[0, 0])
+    names = result.model.provenance.record["refinement"]
+    assert sorted(names["training"] + names["validation"]) == [f"run{k}" for k in range(6)]
+    assert len(names["validation"]) == 1
+
+
+def test_training_errors_fall_within_a_stage(runs, biased):
+    history = refine(biased, runs, CHOICES).history
+    for stage in range(2):
+        errors = [entry["training"] for entry in history if entry["stage"] == stage]
+        assert (np.diff(errors) <= 0).all()
+
+
+def test_the_true_model_is_not_made_worse():
+    clean = [driven(seed, hidden=0.0) for seed in range(4)]
+    model = fit(clean, SETTINGS).model
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        result = refine(model, clean, CHOICES)
+    assert result.after <= result.before
+    test = driven(99, hidden=0.0)
+    assert rollout_error(result.model, test) <= 1.05 * rollout_error(model, test)
+
+
+def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monkeypatch):
+    def nothing(problem, start, penalty):
+        return iter(())
+
+    monkeypatch.setattr("dfsm.refine.levenberg_marquardt", nothing)
+    with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
+        result = refine(biased, runs, CHOICES)
+    assert result.model is biased
+    assert not result.improved
+
+
+def test_the_seed_decides_which_runs_are_held_out(runs, biased):
+    short = replace(CHOICES, windows=(5.0,), iterations=1)
+    held = [refine(biased, runs, short, seed=s).model.provenance.record for s in (0, 0, 2)]
+    names = [tuple(r["refinement"]["validation"]) for r in held]
+    assert names[0] == names[1]
+    assert len(set(names)) > 1
+
+
+def test_slopes_agree_with_differences(runs, biased):
+    record = _record(biased, runs[0], 0.1, 0.0, 20.0)
+    parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
+    problem = _RolloutError(parameters, [record], 5.0, np.ones(2))
+    at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
+    JtJ, Jtr = problem.normal_equations(at)
+    assert JtJ.shape == (parameters.size, parameters.size)
+    eps, slopes = 1e-6, []
+    for k in range(parameters.size):
+        d = eps * np.eye(parameters.size)[k]
+        slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
+    np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["units", "perceptron", "none"])
+def test_deviations_change_what_they_should(kind):
+    rng = np.random.default_rng(0)
+    units = GaussianUnits(
+        jnp.zeros(3),
+        jnp.ones(3),
+        jnp.asarray(rng.normal(size=(3, 4))),
+        jnp.asarray(rng.normal(size=(1, 4))),
+        jnp.zeros(1),
+    )
+    network = Perceptron(
+        jnp.zeros(3),
+        jnp.ones(3),
+        (jnp.asarray(rng.normal(size=(4, 3))), jnp.asarray(rng.normal(size=(1, 4)))),
+        (jnp.zeros(4), jnp.zeros(1)),
+    )
+    model = linear_model(OSCILLATOR_A, np.array([[0.0], [2.0]]))
+    if kind != "none":
+        e = units if kind == "units" else network
+        model = replace(model, e=e, corrected=(1,))
+    parameters = Parametrisation.of(model, np.array([1.0, 2.0]))
+    extra = {"units": 5, "perceptron": 21, "none": 0}[kind]
+    assert parameters.size == 2 * 4 + extra
+    point = jnp.array([0.3, -0.2]), jnp.array([0.7]), jnp.zeros(0)
+    zero = jnp.zeros(parameters.size)
+    np.testing.assert_array_equal(parameters.at(zero).derivative(*point), model.derivative(*point))
+    slopes = jax.jacfwd(lambda w: parameters.at(w).derivative(*point))(zero)
+    assert (np.abs(np.asarray(slopes)).max(axis=0) > 0).all()
+    # Only the last row is corrected, and its spread is the unit of change.
+    assert (np.asarray(slopes)[0, 8:] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"windows": ()}, "refine.windows is .*, expected at least one length"),
+        ({"windows": (0.01,)}, "expected lengths in s, longer than refine.step"),
+        ({"step": 0.0}, "refine.step is 0"),
+        ({"hold_out": 1.0}, "refine.hold_out is 1.0, expected a share between 0 and 1"),
+        ({"iterations": 0}, "refine.iterations is 0, expected at least 1"),
+        ({"weights": {"q": -1.0}}, "refine.weights.q is -1.0, expected 0 or more"),
+    ],
+)
+def test_settings_that_make_no_sense(changes, said):
+    with pytest.raises(DfsmError, match=said):
+        replace(CHOICES, **changes)
+
+
+def test_bad_input(runs, biased):
+    with pytest.raises(DfsmError, match=r"refine\.weights names 'speed', which is no state"):
+        refine(biased, runs, replace(CHOICES, weights={"speed": 1.0}))
+    with pytest.raises(DfsmError, match="one run cannot be split"):
+        refine(biased, runs[:1], CHOICES)
+
+
+def test_no_step_is_begun_after_the_time_given(runs, biased):
+    result = refine(biased, runs, replace(CHOICES, seconds=0.0))
+    assert len(result.history) == len(CHOICES.windows)
+
+
+def test_the_command_line_refines(here, dfsm):
+    content = changed("corrective", value={"kind": "none"})
+    content["refine"] = {"windows": [2.0], "step": 0.1, "iterations": 2}
+    write_config(Path("c.yaml"), content)
+    result = dfsm("fit", "c.yaml", "-o", "m")
+    assert result.code == 0
+    record = load("m").provenance.record
+    if "refinement" in record:
+        assert "the error of rollouts over those held out (" in " ".join(result.out.split())
+    else:
+        assert "refinement did not lower the error" in result.err
+    content["refine"]["windows"] = [-1.0]
+    write_config(Path("c.yaml"), content)
+    refused = dfsm("fit", "c.yaml", "-o", "other")
+    assert refused.code == 2
+    assert "refine.windows is -1.0" in refused.err
+    assert not Path("other").exists()
