@@ -31,6 +31,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Derivative function surrogate models from time-domain simulations.",
 )
+demos = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Studies that bring their own simulations."
+)
+app.add_typer(demos, name="demo")
 
 Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
@@ -254,6 +258,40 @@ def wind(
     for run, target in zip(added, targets, strict=True):
         write_table(run, target)
         _say(f"wrote {target} with RotWind, RotShearV and RotShearH", quiet)
+
+
+@demos.command("two-link-robot")
+def two_link_robot(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the page, its tables and figures.")
+    ] = Path("out"),
+    quick: Annotated[bool, typer.Option("--quick", help="Less of everything: a minute.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the simulations and fits.")] = 0,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat the paper's study of two robot arms, and go beyond it: about four minutes."""
+    from dfsm.console import print_article
+    from dfsm.files import json_value
+    from dfsm.report.publish import page_of, publish
+    from dfsm.report.robot import KEY, robot_article
+    from dfsm.studies.two_link_robot import QUICK, study
+
+    page_of(output, KEY)
+    with _working(quiet):
+        article = robot_article(study(QUICK if quick else None, seed))
+    written = publish(article, output)
+    if as_json:
+        _print_json(json_value(article.to_dict()))
+        return
+    if not quiet:
+        print_article(article)
+    figures = (
+        f", {len(written) - 2} files in {output / 'figures'}"
+        if len(written) > 2
+        else ("; figures for print need matplotlib: pip install 'dfsm[figures]'")
+    )
+    _say(f"wrote {written[0]}, {written[1]}{figures}", quiet)
 
 
 def main() -> None:

@@ -13,7 +13,11 @@ from dfsm.errors import printable
 
 if TYPE_CHECKING:
     from dfsm.read.info import RunInfo
+    from dfsm.report.article import Article
     from dfsm.validate import Validation
+
+# Longer texts in tables are broken into lines.
+_LONG = 45
 
 
 def print_info(runs: Sequence[RunInfo]) -> None:
@@ -94,6 +98,26 @@ def print_validations(found: Mapping[str, Validation]) -> None:
         prefix = f"{label}: " if several else ""
         for text in (*validation.endings(), *validation.outside()):
             console.print(_text(f"{prefix}{text}"))
+
+
+def print_article(article: Article) -> None:
+    """Print the tables of a study; texts and figures are in its page."""
+    console = _console()
+    for section in article.sections:
+        console.print(Text(section.heading, style="bold underline"))
+        for given in section.tables:
+            console.print(Text(f"\n{given.caption}", style="italic"))
+            table = _table(*given.columns)
+            for column, made in enumerate(table.columns):
+                made.justify = "left" if given.is_text(column) else "right"
+                # Sentences may break, numbers and names may not.
+                made.no_wrap = max(len(row[column]) for row in given.texts()) < _LONG
+            for row in given.texts():
+                table.add_row(*map(_text, row))
+            console.print(table)
+            if given.note:
+                console.print(_text(given.note), style="dim")
+        console.print()
 
 
 def _text(text: str) -> Text:
