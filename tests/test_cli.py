@@ -416,7 +416,7 @@ def test_ctrl_c_in_a_real_process(here):
         [SCRIPT, "info", "slow.csv"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     writer = os.open("slow.csv", os.O_WRONLY)  # returns as soon as the command has opened it
-    time.sleep(0.2)
+    time.sleep(2.0)  # and is waiting for data, even on a busy machine
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     os.close(writer)
