@@ -119,7 +119,9 @@ def start() -> dict[str, float]:
 
 
 def _settings() -> dfsm.FitSettings:
-    return replace(demo().settings(5), corrective=dfsm.RBF(samples=UNITS))
+    # The paper's network: one width for all inputs.
+    recipe = dfsm.RBF(samples=UNITS, directions="equal")
+    return replace(demo().settings(5), corrective=recipe)
 
 
 def _with_units(runs: list[dfsm.Trajectory]) -> DFSM:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -102,7 +103,8 @@ def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monk
     def nothing(problem, start, penalty):
         return iter(())
 
-    monkeypatch.setattr("dfsm.refine.levenberg_marquardt", nothing)
+    # By module: `dfsm.refine` is also the function, once somebody has asked the package for it.
+    monkeypatch.setattr(sys.modules[refine.__module__], "levenberg_marquardt", nothing)
     with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
         result = refine(biased, runs, CHOICES)
     assert result.model is biased
@@ -111,7 +113,8 @@ def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monk
 
 def test_the_seed_decides_which_runs_are_held_out(runs, biased):
     short = replace(CHOICES, windows=(5.0,), iterations=1)
-    held = [refine(biased, runs, short, seed=s).model.provenance.record for s in (0, 0, 2)]
+    seeds = (0, 0, 1, 2, 3)
+    held = [refine(biased, runs, short, seed=s).model.provenance.record for s in seeds]
     names = [tuple(r["refinement"]["validation"]) for r in held]
     assert names[0] == names[1]
     assert len(set(names)) > 1
