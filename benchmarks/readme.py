@@ -95,19 +95,24 @@ TABLES = {
 }
 
 
+def fill(path: Path, tables: Mapping[str, list[str]]) -> None:
+    """Put a table between ``<!-- name -->`` and ``<!-- end -->``, wherever that stands."""
+    text = path.read_text(encoding="utf-8")
+    for name, lines in tables.items():
+        mark = f"<!-- {name} -->"
+        if mark in text:
+            head, rest = text.split(mark, 1)
+            tail = rest.split("<!-- end -->", 1)[1]
+            text = "\n".join([head + mark, *lines, "<!-- end -->" + tail])
+    path.write_text(text, encoding="utf-8")
+
+
 def main() -> None:
-    """Replace what stands between ``<!-- name -->`` and ``<!-- end -->``."""
+    """Write the tables that the figures hold."""
     figures = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    tables = {name: table(figures[name]) for name, table in TABLES.items() if name in figures}
     for path in FILES:
-        text = path.read_text(encoding="utf-8")
-        for name, table in TABLES.items():
-            mark = f"<!-- {name} -->"
-            if name in figures and mark in text:
-                head, rest = text.split(mark, 1)
-                tail = rest.split("<!-- end -->", 1)[1]
-                lines = "\n".join(table(figures[name]))
-                text = f"{head}{mark}\n{lines}\n<!-- end -->{tail}"
-        path.write_text(text, encoding="utf-8")
+        fill(path, tables)
 
 
 if __name__ == "__main__":
