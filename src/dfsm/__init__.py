@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dfsm.excitation import Chirp, Multisine, RandomKnots, RandomSteps, Uniform, excite
     from dfsm.features import Feature
     from dfsm.fit import FitResult, fit
+    from dfsm.intervals import Intervals, calibrate
     from dfsm.linear import LPV, LTI
     from dfsm.model import DFSM
     from dfsm.progress import show_progress
@@ -103,6 +104,8 @@ _HOME = {
     "Validation": "validate",
     "compared": "validate",
     "validate": "validate",
+    "calibrate": "intervals",
+    "Intervals": "intervals",
     "write_report": "report",
     "load_config": "config",
 }
