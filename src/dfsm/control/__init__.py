@@ -1,0 +1,22 @@
+"""Open-loop optimal control with a surrogate, or with any model that JAX can follow (Sec. 4).
+
+`problem` says what, `transcription` and `shooting` how; behind them `program` assembles sparse
+nonlinear programs and `nlp` gives them to IPOPT.
+"""
+
+from dfsm.control.problem import OptimalControlProblem
+from dfsm.control.signals import End, Signals
+from dfsm.control.solution import Ending, Replay, Solution
+from dfsm.control.solve import solve
+from dfsm.control.transcription import DirectTranscription
+
+__all__ = [
+    "DirectTranscription",
+    "End",
+    "Ending",
+    "OptimalControlProblem",
+    "Replay",
+    "Signals",
+    "Solution",
+    "solve",
+]
