@@ -15,7 +15,7 @@ import numpy as np
 
 from dfsm.control import OptimalControlProblem
 from dfsm.simulators import ODESystem, two_link_robot
-from dfsm.trajectory import Channel
+from dfsm.trajectory import Channel, Trajectory
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,14 @@ class Known:
         The optimal objective.
     bang_bang
         Whether the optimal controls jump, which limits the accuracy on any mesh.
+    guess
+        Straight lines between two samples, where the ends do not give them.
     """
 
     problem: OptimalControlProblem
     value: float
     bang_bang: bool = False
+    guess: Trajectory | None = None
 
 
 def system(name: str, f: Callable[..., Any], states: int, controls: int = 1) -> ODESystem:
@@ -146,7 +149,9 @@ def brachistochrone() -> Known:
         final_cost=lambda start, end: end.t,
         name=model.name,
     )
-    return Known(problem, 0.8164698961603185)
+    # The ends do not tell the straight line of the speed; at rest the angle would have no effect.
+    line = Trajectory([0.0, 1.0], [[0, 0, 0, 0.5], [2, 2, 5, 0.5]], (*channels("x", 3), *channels("u", 1)))
+    return Known(problem, 0.8164698961603185, guess=line)
 
 
 def neuenhofen_kerrigan() -> Known:

@@ -101,6 +101,8 @@ class Program:
         self.G0 = sparse.csr_matrix(sparse.diags(1 / row_scale) @ G0 @ sparse.diags(scale))
         self.n, self.m = len(scale), len(row_scale)
         self.linear_quadratic = False
+        # The solver sees the objective times this.
+        self.objective_scale = 1.0
         self._jacobian_structure()
         self._hessian_structure()
         self._at: dict[str, tuple[bytes, Any]] = {}
@@ -171,10 +173,14 @@ class Program:
 
         return self._once("outputs", z, compute)
 
-    def objective(self, z: Array) -> float:
-        """Return f."""
+    def cost(self, z: Array) -> float:
+        """Return f in physical units."""
         values = zip(self.blocks, self.outputs(z), strict=True)
         return float(sum(b.c @ r.ravel() for b, r in values))
+
+    def objective(self, z: Array) -> float:
+        """Return f, scaled."""
+        return self.objective_scale * self.cost(z)
 
     def constraints(self, z: Array) -> Array:
         """Return g, scaled, shape ``(constraint,)``."""
@@ -185,9 +191,9 @@ class Program:
         return self.G0 @ z + total / self.row_scale
 
     def gradient(self, z: Array) -> Array:
-        """Return ∂f/∂z, shape ``(variable,)``."""
+        """Return ∂f/∂z, scaled, shape ``(variable,)``."""
         found = zip(self._gradients, self._derivatives(z), strict=True)
-        return sum((M @ J for M, J in found), np.zeros(self.n))
+        return self.objective_scale * sum((M @ J for M, J in found), np.zeros(self.n))
 
     def jacobian(self, z: Array) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_pattern`."""
@@ -197,6 +203,7 @@ class Program:
     def hessian(self, z: Array, sigma: float, multipliers: Array) -> Array:
         """Upper triangle of ∂²(σ f + λᵀ g)/∂z² in the order of `hessian_pattern`."""
         x, weights = self.physical(z), multipliers / self.row_scale
+        sigma = sigma * self.objective_scale
         total = np.zeros(len(self.hessian_pattern[0]))
         for b, M in zip(self.blocks, self._hessians, strict=True):
             local = x[b.columns]

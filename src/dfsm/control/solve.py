@@ -32,6 +32,11 @@ _ENDINGS = {
     "failed": Ending.FAILED,
 }
 
+# Objectives below this are scaled up, by no more than that.
+_SMALL, _MOST_SCALE = 0.3, 1e4
+# Meshes are not refined beyond this many intervals.
+_MOST_INTERVALS = 5000
+
 
 def solve(
     problem: OptimalControlProblem,
@@ -84,12 +89,13 @@ def solve(
         options = NlpOptions(method.tolerance, method.most_iterations, warm)
         if multipliers is not None and multipliers.shape != (program.m,):
             multipliers = None
-        outcome = solve_nlp(program, z, options, multipliers)
+        outcome = _solve_scaled(program, z, options, multipliers)
         start = shot.unscaled(outcome.z)
         errors = shot.errors(start)
         record.add(shot, outcome, float(errors.max()))
         done = method.refine is None or errors.max() <= method.refine
-        if done or outcome.ending not in ("solved", "acceptable"):
+        too_many = shot.grid.intervals > _MOST_INTERVALS
+        if done or too_many or outcome.ending not in ("solved", "acceptable"):
             break
         if round_ < method.most_refinements:
             grid = grid.refined(errors, method.refine)
@@ -102,6 +108,29 @@ def solve(
             warm, multipliers = True, None
     record.coarse = method.refine is not None and record.error > method.refine
     return _solution(problem, record, start, simulate)
+
+
+def _solve_scaled(
+    program: Program, z: Array, options: NlpOptions, multipliers: Array | None
+) -> Outcome:
+    """Solve, and again if the objective turns out to be so small that tolerances hide it."""
+    outcome = solve_nlp(program, z, options, multipliers)
+    value = abs(program.cost(outcome.z))
+    if not (outcome.ending in ("solved", "acceptable") and 0 < value < _SMALL):
+        return outcome
+    program.objective_scale = min(1 / value, _MOST_SCALE)
+    again = replace(options, warm=True)
+    second = solve_nlp(program, outcome.z, again, outcome.multipliers * program.objective_scale)
+    if second.ending != "solved":
+        program.objective_scale = 1.0
+        return outcome
+    return replace(
+        second,
+        multipliers=second.multipliers / program.objective_scale,
+        bound_multipliers=second.bound_multipliers / program.objective_scale,
+        iterations=outcome.iterations + second.iterations,
+        seconds=outcome.seconds + second.seconds,
+    )
 
 
 class _Record:
@@ -121,7 +150,7 @@ class _Record:
         self.meshes.append(
             {
                 "intervals": shot.grid.intervals,
-                "objective": shot.program.objective(outcome.z),
+                "objective": shot.program.cost(outcome.z),
                 "error": error,
                 "iterations": outcome.iterations,
             }
@@ -137,7 +166,7 @@ def _solution(
     if ending is Ending.SOLVED and record.coarse:
         ending = Ending.COARSE
     final_cost = float(program.blocks[1].c @ program.outputs(z)[1].ravel())
-    objective = program.objective(z)
+    objective = program.cost(z)
     trajectories = trajectories_of(problem, shot.tau, start)
     replays = ()
     if simulate and ending.solved:

@@ -56,7 +56,7 @@ class DirectTranscription:
     degree: int = 3
     mesh: int | Sequence[float] = 20
     refine: float | None = 1e-6
-    most_refinements: int = 10
+    most_refinements: int = 8
     stay_inside: bool = False
     tolerance: float = 1e-8
     most_iterations: int = 500
