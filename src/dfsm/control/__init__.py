@@ -5,6 +5,7 @@ nonlinear programs and `nlp` gives them to IPOPT.
 """
 
 from dfsm.control.problem import OptimalControlProblem
+from dfsm.control.shooting import MultipleShooting, SingleShooting
 from dfsm.control.signals import End, Signals
 from dfsm.control.solution import Ending, Replay, Solution
 from dfsm.control.solve import solve
@@ -14,9 +15,11 @@ __all__ = [
     "DirectTranscription",
     "End",
     "Ending",
+    "MultipleShooting",
     "OptimalControlProblem",
     "Replay",
     "Signals",
+    "SingleShooting",
     "Solution",
     "solve",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,7 @@ from scipy import sparse
 from dfsm.control.grid import Grid
 from dfsm.control.layout import Layout
 from dfsm.control.problem import level
-from dfsm.control.program import Rows
+from dfsm.control.program import Block, Program, Rows
 from dfsm.types import Array, IntArray
 
 # Row, column and value of matrix elements.
@@ -77,6 +78,49 @@ def named(parts: Sequence[Part]) -> list[Rows]:
     return found
 
 
+def program_of(
+    layout: Layout,
+    parts: Sequence[Part],
+    nodes: Block,
+    common: Any,
+    sizes: tuple[Array, Array, Array],
+) -> Program:
+    """Put constraints, the block of the nodes and that of the ends together.
+
+    Parameters
+    ----------
+    layout, parts, nodes
+        Variables, constraints, and the terms at the nodes.
+    common
+        What the functions of the ends share.
+    sizes
+        Lower and upper limits and sizes of the variables.
+    """
+    outputs = 1 + sum(layout.functions.boundary_sizes.values())
+    c = np.zeros((layout.scenarios, outputs))
+    c[:, 0] = layout.problem.scenario_weights
+    x = layout.columns[0]
+    ends = Block(
+        layout.functions.ends,
+        np.concatenate([x[:, 0], x[:, -1], layout.shared[:, 0]], axis=1),
+        {"scenario": np.arange(layout.scenarios)},
+        common,
+        stacked(parts, "ends", c.size),
+        c.ravel(),
+    )
+    low, high, scale = sizes
+    limits = (np.concatenate([getattr(p, k) for p in parts]) for k in ("low", "high"))
+    return Program(
+        (nodes, ends),
+        stacked(parts, "linear", layout.count),
+        (low, high, *limits),  # pyright: ignore[reportArgumentType]
+        scale,
+        np.concatenate([p.size for p in parts]),
+        named(parts),
+        layout.names(),
+    )
+
+
 def defects(layout: Layout, grid: Grid, scale: Array, outputs: int) -> Part:
     """D X − T A F = 0; the outputs of a node are [T L, T ẋ, …]."""
     x, _, _ = layout.columns
@@ -101,8 +145,11 @@ def defects(layout: Layout, grid: Grid, scale: Array, outputs: int) -> Part:
     return Part(zeros, zeros, size, rows, linear, entries(to, source, -A.data[:, None]))
 
 
-def path(layout: Layout, outputs: int, offset: int, nodes: IntArray) -> Part:
-    """Path constraints and bounded outputs at some nodes, from `offset` on in their outputs."""
+def path(layout: Layout, nodes: IntArray, source: IntArray) -> Part:
+    """Path constraints and bounded outputs at some nodes, from the outputs `source`.
+
+    `source` has shape ``(scenario, node)`` and names the first output of each node.
+    """
     problem, sizes = layout.problem, layout.functions.path_sizes
     width, time = sum(sizes.values()), layout.time[nodes]
     shape = (layout.scenarios, len(nodes), width)
@@ -120,10 +167,9 @@ def path(layout: Layout, outputs: int, offset: int, nodes: IntArray) -> Part:
             times = np.tile(time, layout.scenarios)
             rows.append(Rows(label, index[:, :, column].ravel(), times))
             column += 1
-    scenario = np.arange(layout.scenarios)[:, None, None]
-    source = (scenario * layout.nodes + nodes[None, :, None]) * outputs + offset + np.arange(width)
     size = np.broadcast_to(sizes_of(low, high, (0, 1)), shape).ravel()
-    return Part(low.ravel(), high.ravel(), size, rows, node=entries(index, source, 1.0))
+    node = entries(index, source[:, :, None] + np.arange(width), 1.0)
+    return Part(low.ravel(), high.ravel(), size, rows, node=node)
 
 
 def boundary(layout: Layout, outputs: int) -> Part:

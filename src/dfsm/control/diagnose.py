@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dfsm.control.functions import Functions
 from dfsm.control.nlp import violation
 from dfsm.control.program import Program, Rows
 from dfsm.errors import DfsmError
@@ -71,16 +70,22 @@ def _when(time: float) -> str:
 
 
 def require_finite(
-    program: Program, functions: Functions, z: Array, time: Array, what: str
+    program: Program,
+    z: Array,
+    time: Array,
+    names: tuple[Sequence[str], Sequence[str]],
+    what: str,
 ) -> None:
     """Refuse a point at which a function or its slope is not finite.
 
     Parameters
     ----------
-    program, functions, z
+    program, z
         Where.
     time
         Of the rows of the first block, shape ``(row,)``, in s.
+    names
+        Of the outputs of every block.
     what
         Names the point in the message.
 
@@ -89,7 +94,6 @@ def require_finite(
     DfsmError
         Names the function and the first time.
     """
-    names = output_names(functions)
     slopes = [
         b.term.jacobian(program.physical(z)[b.columns], b.data, b.common) for b in program.blocks
     ]
@@ -104,18 +108,3 @@ def require_finite(
                     f"{kind}{labels[column]} is not finite{where} for {what}: give a guess or "
                     "bounds where it is, or correct the function"
                 )
-
-
-def output_names(functions: Functions) -> tuple[Sequence[str], Sequence[str]]:
-    """What the outputs of nodes and of ends are called."""
-    path, boundary = functions.path_sizes, functions.boundary_sizes
-    states = functions.plant.names("states")
-    node = ["the cost", *(f"the derivative of {n}" for n in states)]
-    node += [f"'{n}'" for n, count in path.items() for _ in range(count)]
-    ends = ["the final cost", *(f"'{n}'" for n, count in boundary.items() for _ in range(count))]
-    return node, ends
-
-
-def rows_named(rows: Sequence[Rows], names: Sequence[str]) -> list[Rows]:
-    """Keep the rows of some names."""
-    return [r for r in rows if r.name in names]

@@ -111,6 +111,8 @@ class Functions:
     ----------
     slopes, node, ends
         Terms with the outputs ẋ; [T L, T ẋ, path constraints]; [M, boundary constraints].
+    segments
+        Terms of shooting, by what a segment consists of.
     path_sizes, boundary_sizes
         Number of values of every constraint by name; bounded outputs are path constraints too.
     """
@@ -129,6 +131,7 @@ class Functions:
         self.path_sizes, self.boundary_sizes = _sizes(self, problem)
         self.node, self.ends = Term(self._node_row), Term(self._ends_row)
         self.slopes = Term(self._slopes_row)
+        self.segments: dict[tuple[int, int], Term] = {}
 
     def unpack(self, q: jax.Array, common: Any) -> tuple[jax.Array, jax.Array]:
         """Parameters and the last time from free ones and the fixed values."""

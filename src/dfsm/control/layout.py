@@ -136,7 +136,7 @@ class Layout:
             ("controls", u, self.control_nodes),
         ):
             for i, name in enumerate(plant.names(group)):
-                below, above = self._channel_limits(name, self.time[nodes])
+                below, above = self.channel_limits(name, self.time[nodes])
                 low[columns[:, nodes, i]], high[columns[:, nodes, i]] = below, above
         for i, name in enumerate(plant.names("states")):
             for which, node in (("initial", 0), ("final", -1)):
@@ -153,7 +153,8 @@ class Layout:
             low[q[-1]], high[q[-1]] = self.problem.free_time
         return np.where(low <= -_NONE, -np.inf, low), np.where(high >= _NONE, np.inf, high)
 
-    def _channel_limits(self, name: str, time: Array) -> tuple[Array, Array]:
+    def channel_limits(self, name: str, time: Array) -> tuple[Array, Array]:
+        """Bounds of a state or control at times in s, the training range included if asked."""
         return self._inside(name, *self.problem.limits(name, time))
 
     def _inside(self, name: str, low: Array, high: Array) -> tuple[Array, Array]:

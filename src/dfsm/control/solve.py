@@ -16,11 +16,15 @@ from dfsm.control.nlp import NlpOptions, Outcome, solve_nlp
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.program import Program
 from dfsm.control.replay import replay
+from dfsm.control.shooting import MultipleShooting, Shooting, SingleShooting
 from dfsm.control.solution import Ending, Solution
 from dfsm.control.transcription import DirectTranscription, Transcription, node_data
 from dfsm.errors import DfsmError
 from dfsm.trajectory import Role, Trajectory
 from dfsm.types import Array
+
+Shot = Transcription | Shooting
+Method = DirectTranscription | MultipleShooting | SingleShooting
 
 _ENDINGS = {
     "solved": Ending.SOLVED,
@@ -32,15 +36,15 @@ _ENDINGS = {
     "failed": Ending.FAILED,
 }
 
-# Objectives below this are scaled up, by no more than that.
-_SMALL, _MOST_SCALE = 0.3, 1e4
+# Objectives that are smaller than 1 by this factor are scaled up, by no more than the second.
+_CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Meshes are not refined beyond this many intervals.
 _MOST_INTERVALS = 5000
 
 
 def solve(
     problem: OptimalControlProblem,
-    method: DirectTranscription | None = None,
+    method: Method | None = None,
     guess: Solution | Trajectory | None = None,
     simulate: bool = True,
 ) -> Solution:
@@ -51,7 +55,8 @@ def solve(
     problem
         What to minimise, subject to what.
     method
-        How; default `DirectTranscription` with its defaults.
+        `DirectTranscription`, `MultipleShooting` or `SingleShooting`; None is the first with its
+        defaults.
     guess
         None starts from straight lines between the ends. A run gives the states and controls that
         it holds; a solution, of any mesh or method, gives all and is stayed close to.
@@ -77,59 +82,78 @@ def solve(
     if isinstance(guess, Solution) and np.array_equal(guess.grid.edges, grid.edges):
         multipliers = guess.solver_state
     record = _Record()
-    for round_ in range(method.most_refinements + 1):
+    # What direct transcription has and shooting has not.
+    refine = method.refine if isinstance(method, DirectTranscription) else None
+    rounds = method.most_refinements if isinstance(method, DirectTranscription) else 0
+    for round_ in range(rounds + 1):
         begin = clock.perf_counter()
-        shot = Transcription(problem, grid, start, method.stay_inside)
-        program = shot.program
+        if isinstance(method, DirectTranscription):
+            shot = Transcription(problem, grid, start, method.stay_inside)
+        else:
+            shot = Shooting(problem, method, start)
         z = shot.scaled(start)
-        times = np.tile(shot.layout.time, shot.layout.scenarios)
-        require_finite(program, shot.functions, z, times, "the guess")
-        program.hessian(z, 1.0, np.zeros(program.m))
+        shot.program.objective_scale = record.objective_scale
+        _prepare(shot, z)
         record.compile += clock.perf_counter() - begin
         options = NlpOptions(method.tolerance, method.most_iterations, warm)
-        if multipliers is not None and multipliers.shape != (program.m,):
-            multipliers = None
-        outcome = _solve_scaled(program, z, options, multipliers)
+        outcome = _solve_scaled(shot.program, z, options, multipliers)
         start = shot.unscaled(outcome.z)
         errors = shot.errors(start)
         record.add(shot, outcome, float(errors.max()))
-        done = method.refine is None or errors.max() <= method.refine
-        too_many = shot.grid.intervals > _MOST_INTERVALS
-        if done or too_many or outcome.ending not in ("solved", "acceptable"):
+        done = refine is None or errors.max() <= refine or grid.intervals > _MOST_INTERVALS
+        if done or round_ == rounds or outcome.ending not in ("solved", "acceptable"):
             break
-        if round_ < method.most_refinements:
-            grid = grid.refined(errors, method.refine)
-            start = Start(
-                np.stack([shot.grid.states(X, grid.tau) for X in start.X]),
-                np.stack([shot.grid.controls(U, grid.tau) for U in start.U]),
-                start.p,
-                start.stop,
-            )
-            warm, multipliers = True, None
-    record.coarse = method.refine is not None and record.error > method.refine
+        old, grid = grid, grid.refined(errors, refine)
+        start = replace(
+            start,
+            X=np.stack([old.states(X, grid.tau) for X in start.X]),
+            U=np.stack([old.controls(U, grid.tau) for U in start.U]),
+        )
+        warm, multipliers = True, None
+    record.coarse = refine is not None and not record.error <= refine
     return _solution(problem, record, start, simulate)
+
+
+def _prepare(shot: Shot, z: Array) -> None:
+    """Refuse a start at which something is not finite, and compile all that the solver calls."""
+    require_finite(shot.program, z, node_times(shot), output_names(shot), "the guess")
+    shot.program.hessian(z, 1.0, np.zeros(shot.program.m))
 
 
 def _solve_scaled(
     program: Program, z: Array, options: NlpOptions, multipliers: Array | None
 ) -> Outcome:
     """Solve, and again if the objective turns out to be so small that tolerances hide it."""
-    outcome = solve_nlp(program, z, options, multipliers)
-    value = abs(program.cost(outcome.z))
-    if not (outcome.ending in ("solved", "acceptable") and 0 < value < _SMALL):
-        return outcome
-    program.objective_scale = min(1 / value, _MOST_SCALE)
-    again = replace(options, warm=True)
-    second = solve_nlp(program, outcome.z, again, outcome.multipliers * program.objective_scale)
+    scale = program.objective_scale
+    first = _solve_once(program, z, options, multipliers)
+    value = abs(program.cost(first.z))
+    wanted = min(1 / max(value, 1e-300), _MOST_SCALE)
+    if first.ending not in ("solved", "acceptable") or value == 0 or wanted < _CLEARLY * scale:
+        return first
+    program.objective_scale = wanted
+    second = _solve_once(program, first.z, replace(options, warm=True), first.multipliers)
     if second.ending != "solved":
-        program.objective_scale = 1.0
-        return outcome
+        program.objective_scale = scale
+        return first
     return replace(
         second,
-        multipliers=second.multipliers / program.objective_scale,
-        bound_multipliers=second.bound_multipliers / program.objective_scale,
-        iterations=outcome.iterations + second.iterations,
-        seconds=outcome.seconds + second.seconds,
+        iterations=first.iterations + second.iterations,
+        seconds=first.seconds + second.seconds,
+    )
+
+
+def _solve_once(
+    program: Program, z: Array, options: NlpOptions, multipliers: Array | None
+) -> Outcome:
+    """Solve; multipliers, given and found, are those of the objective without its scale."""
+    scale = program.objective_scale
+    if multipliers is not None:
+        multipliers = None if len(multipliers) != program.m else scale * multipliers
+    found = solve_nlp(program, z, options, multipliers)
+    return replace(
+        found,
+        multipliers=found.multipliers / scale,
+        bound_multipliers=found.bound_multipliers / scale,
     )
 
 
@@ -141,10 +165,12 @@ class _Record:
         self.meshes: list[dict[str, Any]] = []
         self.iterations = 0
         self.coarse = False
+        self.objective_scale = 1.0
 
-    def add(self, shot: Transcription, outcome: Outcome, error: float) -> None:
+    def add(self, shot: Shot, outcome: Outcome, error: float) -> None:
         """Keep one mesh."""
         self.shot, self.outcome, self.error = shot, outcome, error
+        self.objective_scale = shot.program.objective_scale
         self.solve += outcome.seconds
         self.iterations += outcome.iterations
         self.meshes.append(
@@ -196,15 +222,36 @@ def _solution(
     )
 
 
-def _reason(shot: Transcription, outcome: Outcome) -> str:
+def _reason(shot: Shot, outcome: Outcome) -> str:
     program, z = shot.program, outcome.z
     if outcome.ending == "not finite":
         try:
-            times = np.tile(shot.layout.time, shot.layout.scenarios)
-            require_finite(program, shot.functions, z, times, "the last iterate")
+            require_finite(program, z, node_times(shot), output_names(shot), "the last iterate")
         except DfsmError as error:
             return str(error).split(": give a guess")[0]
     return conflict(program, z)
+
+
+def node_times(shot: Shot) -> Array:
+    """Time in s of every row of the first block: of nodes, or of the starts of segments."""
+    layout = shot.layout
+    time = layout.time if isinstance(shot, Transcription) else layout.time[layout.state_nodes[:-1]]
+    return np.tile(time, layout.scenarios)
+
+
+def output_names(shot: Shot) -> tuple[list[str], list[str]]:
+    """What the outputs of the two blocks are called."""
+    functions = shot.functions
+    path, boundary = functions.path_sizes, functions.boundary_sizes
+    states = functions.plant.names("states")
+    node = ["the cost", *(f"the derivative of '{n}'" for n in states)]
+    paths = [f"'{n}'" for n, count in path.items() for _ in range(count)]
+    if isinstance(shot, Shooting):
+        pieces = shot.method.pieces
+        node = ["the cost", *(f"the simulated '{n}'" for n in states * pieces)]
+        paths *= pieces + 1
+    ends = [f"'{n}'" for n, count in boundary.items() for _ in range(count)]
+    return [*node, *paths], ["the final cost", *ends]
 
 
 def _multipliers(program: Program, outcome: Outcome) -> dict[str, Array]:

@@ -105,50 +105,31 @@ class Transcription:
         scale = layout.scale(low, high)
         outputs = 1 + functions.nx + sum(functions.path_sizes.values())
         end_outputs = 1 + sum(functions.boundary_sizes.values())
+        # Constraints hold where there is a control; they come after the cost and the slopes.
+        at = np.arange(layout.scenarios)[:, None] * layout.nodes + layout.control_nodes
         parts = [
             constraints.defects(layout, self.grid, scale, outputs),
-            constraints.path(layout, outputs, 1 + functions.nx, layout.control_nodes),
+            constraints.path(layout, layout.control_nodes, at * outputs + 1 + functions.nx),
             constraints.boundary(layout, end_outputs),
             *constraints.rates(layout, scale),
         ]
         weights = self.problem.scenario_weights
-        c_node = np.zeros((layout.scenarios, layout.nodes, outputs))
-        c_node[..., 0] = weights[:, None] * self.grid.weights
-        c_end = np.zeros((layout.scenarios, end_outputs))
-        c_end[:, 0] = weights
+        c = np.zeros((layout.scenarios, layout.nodes, outputs))
+        c[..., 0] = weights[:, None] * self.grid.weights
         x, u, _ = layout.columns
         local = np.concatenate([x, u, layout.shared], axis=2)
-        ends = np.concatenate([x[:, 0], x[:, -1], layout.shared[:, 0]], axis=1)
-        blocks = (
-            Block(
-                functions.node,
-                local.reshape(-1, local.shape[2]),
-                node_data(self.problem, layout.tau, layout.time),
-                self.common,
-                constraints.stacked(parts, "node", c_node.size),
-                c_node.ravel(),
-            ),
-            Block(
-                functions.ends,
-                ends,
-                {"scenario": np.arange(layout.scenarios)},
-                self.common,
-                constraints.stacked(parts, "ends", c_end.size),
-                c_end.ravel(),
-            ),
+        nodes = Block(
+            functions.node,
+            local.reshape(-1, local.shape[2]),
+            node_data(self.problem, layout.tau, layout.time),
+            self.common,
+            constraints.stacked(parts, "node", c.size),
+            c.ravel(),
         )
-        program = Program(
-            blocks,
-            constraints.stacked(parts, "linear", layout.count),
-            (low, high, *(np.concatenate([getattr(p, k) for p in parts]) for k in ("low", "high"))),
-            scale,
-            np.concatenate([p.size for p in parts]),
-            constraints.named(parts),
-            layout.names(),
-        )
+        program = constraints.program_of(layout, parts, nodes, self.common, (low, high, scale))
         z = np.ones(layout.count)
         program.linear_quadratic = all(
-            b.term.is_quadratic(z[b.columns], b.data, b.common, 1) for b in blocks
+            b.term.is_quadratic(z[b.columns], b.data, b.common, 1) for b in program.blocks
         )
         return program
 
