@@ -38,14 +38,17 @@ class Term:
     ----------
     function
         Takes a local vector ``(local,)``, data of its row and data common to all rows.
+    parts
+        Functions of the same arguments that give its objective and its constraints, where they
+        can be told apart.
     """
 
-    def __init__(self, function: Local) -> None:
+    def __init__(self, function: Local, parts: tuple[Local, Local] | None = None) -> None:
         def weighted(z: jax.Array, data: Any, common: Any, weights: jax.Array) -> jax.Array:
             return weights @ function(z, data, common)
 
         rows = (0, 0, None)
-        self.function = function
+        self.parts = parts
         self._values = jax.jit(jax.vmap(function, rows))
         self._jacobian = jax.jit(jax.vmap(jax.jacfwd(function), rows))
         self._hessian = jax.jit(jax.vmap(jax.jacfwd(jax.grad(weighted)), (*rows, 0)))
@@ -62,19 +65,17 @@ class Term:
         """Hessians of the outputs times weights ``(row, output)``, ``(row, local, local)``."""
         return self._padded(self._hessian, common, z, data, weights)
 
-    def is_quadratic(self, z: Array, data: Any, common: Any, first: int) -> bool:
-        """Whether outputs from `first` on are affine and the ones before at most quadratic.
+    def is_quadratic(self, z: Array, data: Any, common: Any) -> bool:
+        """Whether the objective is at most quadratic and the constraints are affine.
 
         Proved on the traced code; a False may be overcautious.
         """
+        if self.parts is None:
+            return False
         example = (z[0], jax.tree.map(lambda a: a[0], data), common)
-
-        def part(rows: slice) -> Local:
-            return lambda z, data, common: self.function(z, data, common)[rows]
-
-        affine = jax.jacfwd(part(slice(first, None)))
-        quadratic = jax.jacfwd(jax.jacrev(part(slice(None, first))))
-        return not (varies(affine, *example) or varies(quadratic, *example))
+        objective, constraints = self.parts
+        second, first = jax.jacfwd(jax.jacrev(objective)), jax.jacfwd(constraints)
+        return not (varies(second, *example) or varies(first, *example))
 
     @staticmethod
     def _padded(function: Callable[..., jax.Array], common: Any, z: Array, *rest: Any) -> Array:
@@ -129,7 +130,8 @@ class Functions:
         self._boundary = {n: c[0] for n, c in problem.boundary.items()}
         self._outputs = tuple(n for n in self.plant.names("outputs") if n in problem.bounds)
         self.path_sizes, self.boundary_sizes = _sizes(self, problem)
-        self.node, self.ends = Term(self._node_row), Term(self._ends_row)
+        self.node = _joined(self._node_cost, self._node_constraints)
+        self.ends = _joined(self._ends_cost, self._ends_constraints)
         self.slopes = Term(self._slopes_row)
         self.segments: dict[tuple[int, int], Term] = {}
 
@@ -166,10 +168,13 @@ class Functions:
         parts += [jnp.stack([s.y[n] for n in self._outputs])] if self._outputs else []
         return jnp.concatenate([jnp.zeros(0), *parts])
 
-    def _node_row(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
+    def _node_cost(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
+        s, _, duration = self.signals(z, data, common)
+        return self.integrand(s) * duration
+
+    def _node_constraints(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
         s, vectors, duration = self.signals(z, data, common)
-        parts = [self.integrand(s) * duration, self.plant.derivative(*vectors) * duration]
-        return jnp.concatenate([*parts, self.path(s)])
+        return jnp.concatenate([self.plant.derivative(*vectors) * duration, self.path(s)])
 
     def _slopes_row(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
         return self.plant.derivative(*self.signals(z, data, common)[1])
@@ -180,11 +185,24 @@ class Functions:
         p, stop = self.unpack(q, common)
         return End(self.plant, common["start"], first, p), End(self.plant, stop, last, p)
 
-    def _ends_row(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
+    def _ends_cost(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
+        if self._final_cost is None:
+            return jnp.zeros(1)
+        return scalar(self._final_cost, "the final cost", *self.end_pair(z, common))
+
+    def _ends_constraints(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
         ends = self.end_pair(z, common)
-        M = scalar(self._final_cost, "the final cost", *ends) if self._final_cost else jnp.zeros(1)
         parts = [vector(f, f"boundary '{n}'", *ends) for n, f in self._boundary.items()]
-        return jnp.concatenate([M, *parts])
+        return jnp.concatenate([jnp.zeros(0), *parts])
+
+
+def _joined(objective: Local, constraints: Local) -> Term:
+    """A term whose first output is the objective's."""
+
+    def both(z: jax.Array, data: Any, common: Any) -> jax.Array:
+        return jnp.concatenate([f(z, data, common) for f in (objective, constraints)])
+
+    return Term(both, (objective, constraints))
 
 
 def functions_of(problem: OptimalControlProblem) -> Functions:

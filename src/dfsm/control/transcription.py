@@ -129,7 +129,7 @@ class Transcription:
         program = constraints.program_of(layout, parts, nodes, self.common, (low, high, scale))
         z = np.ones(layout.count)
         program.linear_quadratic = all(
-            b.term.is_quadratic(z[b.columns], b.data, b.common, 1) for b in program.blocks
+            b.term.is_quadratic(z[b.columns], b.data, b.common) for b in program.blocks
         )
         return program
 
