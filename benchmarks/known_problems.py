@@ -43,7 +43,7 @@ class Known:
 def system(name: str, f: Callable[..., Any], states: int, controls: int = 1) -> ODESystem:
     """An autonomous system f(x, u) with channels x1, x2, …, u1, …, without units."""
     return ODESystem(
-        f=lambda x, u, w, p: jnp.stack(f(x, u)),
+        f=lambda x, u, _w, _p: jnp.stack(f(x, u)),
         states=channels("x", states),
         controls=channels("u", controls),
         name=name,
@@ -51,7 +51,7 @@ def system(name: str, f: Callable[..., Any], states: int, controls: int = 1) -> 
 
 
 def channels(letter: str, count: int) -> tuple[Channel, ...]:
-    """Channels without a unit: x1, x2, …"""
+    """Channels x1, x2, … without a unit."""
     return tuple(Channel(f"{letter}{i + 1}", "-") for i in range(count))
 
 
@@ -76,11 +76,7 @@ def hager_hou_rao_1() -> Known:
         horizon=(0.0, 1.0),
         initial=ends([1.0, 1.0]),
         cost=lambda s: (
-            2 * (s.x.x1 * s.x.x2) ** 2
-            + 1.25 / s.x.x2**2
-            + s.u.u2 / s.x.x2
-            + s.u.u1**2
-            + s.u.u2**2
+            2 * (s.x.x1 * s.x.x2) ** 2 + 1.25 / s.x.x2**2 + s.u.u2 / s.x.x2 + s.u.u1**2 + s.u.u2**2
         ),
         name=model.name,
     )
@@ -104,16 +100,14 @@ def nonlinear_1d() -> Known:
 
 def bryson_ho_59() -> Known:
     """Steering for the largest final speed."""
-    model = system(
-        "BrysonHo59", lambda x, u: [jnp.cos(u[0]), jnp.sin(u[0]), x[0], x[1]], 4
-    )
+    model = system("BrysonHo59", lambda x, u: [jnp.cos(u[0]), jnp.sin(u[0]), x[0], x[1]], 4)
     problem = OptimalControlProblem(
         model=model,
         horizon=(0.0, 2.05),
         initial=ends([0.0, 0.0, 0.0, 0.0]),
         final=ends([None, 0.0, None, 1.0]),
         bounds={"x4": (0.0, None), "u1": (-np.pi, np.pi)},
-        final_cost=lambda start, end: -end.x.x1,
+        final_cost=lambda _start, end: -end.x.x1,
         name=model.name,
     )
     return Known(problem, -0.8047832094009657)
@@ -121,7 +115,7 @@ def bryson_ho_59() -> Known:
 
 def bryson_ho_64() -> Known:
     """A soap film between two rings."""
-    model = system("BrysonHo64", lambda x, u: [u[0]], 1)
+    model = system("BrysonHo64", lambda _x, u: [u[0]], 1)
     problem = OptimalControlProblem(
         model=model,
         horizon=(-0.45, 0.45),
@@ -146,11 +140,15 @@ def brachistochrone() -> Known:
         horizon=(0.0, (0.01, 200.0)),
         initial=ends([0.0, 0.0, 0.0]),
         final=ends([2.0, 2.0]),
-        final_cost=lambda start, end: end.t,
+        final_cost=lambda _start, end: end.t,
         name=model.name,
     )
     # The ends do not tell the straight line of the speed; at rest the angle would have no effect.
-    line = Trajectory([0.0, 1.0], [[0, 0, 0, 0.5], [2, 2, 5, 0.5]], (*channels("x", 3), *channels("u", 1)))
+    line = Trajectory(
+        np.array([0.0, 1.0]),
+        np.array([[0, 0, 0, 0.5], [2, 2, 5, 0.5]]),
+        (*channels("x", 3), *channels("u", 1)),
+    )
     return Known(problem, 0.8164698961603185, guess=line)
 
 
@@ -164,7 +162,7 @@ def neuenhofen_kerrigan() -> Known:
         horizon=(0.0, 1.0),
         initial=ends([1.0, 0.0]),
         bounds={"u1": (-1.0, None), "x1": (float(np.sqrt(0.4)), None)},
-        final_cost=lambda start, end: end.x.x2,
+        final_cost=lambda _start, end: end.x.x2,
         name=model.name,
     )
     return Known(problem, 2.0578660)
@@ -200,9 +198,7 @@ def hager_1() -> Known:
 
 def vanderpol() -> Known:
     """An oscillator with a bounded force."""
-    model = system(
-        "Vanderpol", lambda x, u: [x[1], -x[0] + x[1] - x[0] ** 2 * x[1] + u[0]], 2
-    )
+    model = system("Vanderpol", lambda x, u: [x[1], -x[0] + x[1] - x[0] ** 2 * x[1] + u[0]], 2)
     problem = OptimalControlProblem(
         model=model,
         horizon=(0.0, 5.0),
@@ -241,7 +237,7 @@ def robot_time() -> Known:
         initial=_ROBOT_START,
         final=_ROBOT_END,
         bounds=_ROBOT_BOUNDS,
-        final_cost=lambda start, end: end.t,
+        final_cost=lambda _start, end: end.t,
         name="TwoLinkRobot, time",
     )
     return Known(problem, 2.98228, bang_bang=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from dfsm.control.transcription import Transcription
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.known_problems import PROBLEMS, Known  # noqa: E402
+from benchmarks.known_problems import PROBLEMS, Known
 
 # One object per problem, so that all tests share its compiled functions.
 KNOWN: dict[str, Known] = {}
@@ -110,7 +111,7 @@ def assert_exact(program, middle):
 def dense(pattern, values, shape):
     rows, starts = pattern
     full = np.zeros(shape)
-    for column, (first, last) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+    for column, (first, last) in enumerate(itertools.pairwise(starts)):
         full[rows[first:last], column] = values[first:last]
     return full
 

@@ -130,9 +130,9 @@ def defects(layout: Layout, grid: Grid, scale: Array, outputs: int) -> Part:
     # Axes: scenario, element of the matrix, state.
     state = np.arange(nx)
     to = (scenario * D.shape[0] + D.row[None, :, None]) * nx + state
-    linear = entries(to, x[:, D.col, :], D.data[:, None])
+    linear = entries(to, x[:, D.column, :], D.value[:, None])
     to = (scenario * D.shape[0] + A.row[None, :, None]) * nx + state
-    source = (scenario * layout.nodes + A.col[None, :, None]) * outputs + 1 + state
+    source = (scenario * layout.nodes + A.column[None, :, None]) * outputs + 1 + state
     index = np.arange(np.prod(shape)).reshape(shape)
     middle = grid.edges[:-1] + grid.lengths / 2
     times = np.interp(np.repeat(middle, shape[1] // grid.intervals), layout.tau, layout.time)
@@ -142,7 +142,7 @@ def defects(layout: Layout, grid: Grid, scale: Array, outputs: int) -> Part:
     ]
     zeros = np.zeros(index.size)
     size = np.broadcast_to(scale[x[:, :1, :]], shape).ravel()
-    return Part(zeros, zeros, size, rows, linear, entries(to, source, -A.data[:, None]))
+    return Part(zeros, zeros, size, rows, linear, entries(to, source, -A.value[:, None]))
 
 
 def path(layout: Layout, nodes: IntArray, source: IntArray) -> Part:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dfsm.control.nlp import violation
-from dfsm.control.program import Program, Rows
+from dfsm.control.program import Program
 from dfsm.errors import DfsmError
 from dfsm.types import Array
 
@@ -99,7 +99,8 @@ def require_finite(
     ]
     for values, kind in ((program.outputs(z), ""), (slopes, "the slope of ")):
         for block, (array, labels) in enumerate(zip(values, names, strict=True)):
-            bad = ~np.isfinite(array.reshape(len(array), len(labels), -1)).all(axis=2)
+            finite = np.isfinite(array.reshape(len(array), len(labels), -1))
+            bad = np.logical_not(finite.all(axis=2))
             if bad.any():
                 column = int(np.argmax(bad.any(axis=0)))
                 row = int(np.argmax(bad[:, column]))

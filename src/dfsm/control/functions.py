@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dfsm.jax_setup  # noqa: F401
-from dfsm.control.problem import OptimalControlProblem
+from dfsm.control.problem import OptimalControlProblem, is_number
 from dfsm.control.signals import End, Signals
 from dfsm.control.structure import varies
 from dfsm.errors import DfsmError
@@ -137,7 +137,7 @@ class Functions:
 
     def unpack(self, q: jax.Array, common: Any) -> tuple[jax.Array, jax.Array]:
         """Parameters and the last time from free ones and the fixed values."""
-        p = common["p"]
+        p = jnp.asarray(common["p"])
         if len(self._free):
             p = p.at[self._free].set(q[: len(self._free)])
         return p, q[-1] if self._timed else common["stop"]
@@ -308,7 +308,7 @@ def example_of(functions: Functions, problem: OptimalControlProblem) -> dict[str
 def common_of(problem: OptimalControlProblem) -> dict[str, Array]:
     """Numbers that all nodes share: fixed parameters, horizon, table of disturbances."""
     given = (problem.parameters[n] for n in problem.plant.names("parameters"))
-    fixed = [float(v) if np.isscalar(v) else np.nan for v in given]  # pyright: ignore
+    fixed = [float(v) if is_number(v) else np.nan for v in given]
     common = {
         "p": np.array(fixed, dtype=np.float64),
         "start": np.float64(problem.start),
@@ -325,4 +325,3 @@ def common_of(problem: OptimalControlProblem) -> dict[str, Array]:
         common["table_time"] = time
         common["table"] = np.stack(values) if values else np.zeros((len(problem.scenarios), 2, 0))
     return common
-

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from dfsm.control.schemes import Kind, Scheme, lagrange, scheme_of
 from dfsm.errors import DfsmError
@@ -23,6 +23,15 @@ _CHECKED = 6
 _CUTS = 4
 # Cut for a little less error than asked, or most intervals would need one more round.
 _MARGIN = 0.5
+
+
+class Matrix(NamedTuple):
+    """A sparse matrix by its elements."""
+
+    row: IntArray
+    column: IntArray
+    value: Array
+    shape: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,17 +85,17 @@ class Grid:
         return total
 
     @cached_property
-    def defects(self) -> tuple[sparse.coo_matrix, sparse.coo_matrix]:
+    def defects(self) -> tuple[Matrix, Matrix]:
         """D and A of all intervals, ``(interval × defect, node)``, A times their lengths."""
         scheme, shape = self.scheme, (self.intervals * len(self.scheme.D), len(self.tau))
         rows = np.arange(shape[0]).reshape(self.intervals, -1, 1)
         columns = np.broadcast_to(self.local[:, None, :], (*rows.shape[:2], self.local.shape[1]))
         rows = np.broadcast_to(rows, columns.shape)
 
-        def spread(M: Array, factor: Array) -> sparse.coo_matrix:
+        def spread(M: Array, factor: Array) -> Matrix:
             values = factor[:, None, None] * M
             keep = values != 0
-            return sparse.coo_matrix((values[keep], (rows[keep], columns[keep])), shape=shape)
+            return Matrix(rows[keep], columns[keep], values[keep], shape)
 
         return spread(scheme.D, np.ones(self.intervals)), spread(scheme.A, self.lengths)
 

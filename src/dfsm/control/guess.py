@@ -150,5 +150,5 @@ def _near(value: float, low: float, high: float) -> float:
 
 
 def _middle(given: float | tuple[float, float]) -> float:
-    low, high = (given, given) if np.isscalar(given) else given  # pyright: ignore
+    low, high = given if isinstance(given, tuple) else (given, given)
     return 0.5 * (float(low) + float(high))

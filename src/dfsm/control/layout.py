@@ -188,7 +188,7 @@ class Layout:
                 half = (high[at].max() - low[at].min()) / 2
                 scale[at] = self._size(name, half, float(np.abs(values[..., i]).max()))
         for at, name, value in zip(q, self.problem.free_parameters, self.start.p, strict=False):
-            scale[at] = self._size(name, (high[at] - low[at]) / 2, abs(value))
+            scale[at] = self._size(name, float(high[at] - low[at]) / 2, abs(value))
         if self.free_time:
             scale[q[-1]] = self.start.stop - self.problem.start
         return scale

@@ -17,7 +17,7 @@ import numpy as np
 
 from dfsm.control.program import Program
 from dfsm.errors import DfsmError
-from dfsm.types import Array
+from dfsm.types import Array, IntArray
 
 # Names that IPOPT gives its outcomes, in groups that ask for the same action.
 _SOLVED = ("Solve_Succeeded", "Feasible_Point_Found")
@@ -232,7 +232,7 @@ def _functions(casadi: Any, program: Program, watch: _Watch) -> dict[str, Any]:
     x, nothing = ("x", dense(n, 1)), ("p", casadi.Sparsity(0, 1))
     f, g, one = ("f", dense(1, 1)), ("g", dense(m, 1)), dense(1, 1)
 
-    def sparsity(height: int, pattern: tuple[Array, Array]) -> Any:
+    def sparsity(height: int, pattern: tuple[IntArray, IntArray]) -> Any:
         rows, starts = pattern
         return casadi.Sparsity(height, n, starts.tolist(), rows.tolist())
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -125,19 +125,19 @@ class OptimalControlProblem:
     def free_time(self) -> tuple[float, float] | None:
         """Limits of a free last time in s, else None."""
         stop = self.horizon[1]
-        return None if np.isscalar(stop) else (float(stop[0]), float(stop[1]))  # pyright: ignore
+        return (float(stop[0]), float(stop[1])) if isinstance(stop, tuple) else None
 
     @property
     def last_time(self) -> float:
         """The last time in s, or the latest one allowed."""
         stop = self.horizon[1]
-        return float(stop) if np.isscalar(stop) else float(stop[1])  # pyright: ignore
+        return float(stop[1] if isinstance(stop, tuple) else stop)
 
     @property
     def free_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are left to the optimiser, in the model's order."""
         names = self.plant.names("parameters")
-        return tuple(n for n in names if not np.isscalar(self.parameters[n]))
+        return tuple(n for n in names if not is_number(self.parameters[n]))
 
     @property
     def scenarios(self) -> tuple[Trajectory | None, ...]:
@@ -163,10 +163,15 @@ class OptimalControlProblem:
     def end_limits(self, which: str, name: str) -> tuple[float, float]:
         """Lower and upper bound of a state at the ``"initial"`` or ``"final"`` time."""
         given = getattr(self, which).get(name, (None, None))
-        if np.isscalar(given):
+        if is_number(given):
             return float(given), float(given)
         low, high = given
         return (-np.inf if low is None else float(low), np.inf if high is None else float(high))
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether a value is one number, and not a pair."""
+    return isinstance(value, int | float | np.number)
 
 
 def level(given: Level, name: str, time: Array, default: float) -> Array:
@@ -303,7 +308,8 @@ def _check_limits(problem: OptimalControlProblem) -> None:
                     f"bounds are {_told(below, above)}: no value meets both"
                 )
     for key in problem.free_parameters:
-        low, high = problem.parameters[key]  # pyright: ignore
+        given = problem.parameters[key]
+        low, high = given if isinstance(given, tuple) else (given, given)
         if not (np.isfinite([low, high]).all() and low <= high):
             raise DfsmError(
                 f"{problem.name}: parameter '{key}' is to be in {_told(low, high)}, expected two "

@@ -1,4 +1,4 @@
-"""The optimal controls in diffrax: does the model do what the transcription says?"""
+"""The optimal controls in diffrax: whether the model does what the transcription says."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Collocation schemes on one interval, each as a few small matrices.
 
 A scheme has points θ₀ = 0 < … < θₘ = 1 on the unit interval, and with states X and slopes
-F = f(X, U) at them its defects are D X − h A F = 0 for an interval of length h. Costs are integrated
-with the weights b. Trapezoidal, Hermite–Simpson (separated) and Legendre–Gauss–Radau collocation
-differ in nothing else (Betts 2010, Ch. 4; Garg et al. 2011).
+F = f(X, U) at them its defects are D X − h A F = 0 for an interval of length h. Costs are
+integrated with the weights b. Trapezoidal, Hermite–Simpson (separated) and Legendre–Gauss–Radau
+collocation differ in nothing else (Betts 2010, Ch. 4; Garg et al. 2011).
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from dfsm.control.program import Block, Program, Rows
 from dfsm.control.transcription import node_data
 from dfsm.settings import require, settings
 from dfsm.trajectory import Channel, Trajectory
-from dfsm.types import Array
+from dfsm.types import Array, IntArray
 
 
 @settings
@@ -183,7 +183,8 @@ class Shooting:
         low, high = layout.limits()
         scale = layout.scale(low, high)
         shape = (layout.scenarios, self.method.segments)
-        first = np.arange(np.prod(shape)).reshape(shape) * self._outputs
+        first = np.arange(int(np.prod(shape)), dtype=np.int64).reshape(shape)
+        first *= self._outputs
         parts = [
             self._joints(first, scale),
             self._inner_bounds(first, scale),
@@ -208,7 +209,7 @@ class Shooting:
         )
         return constraints.program_of(layout, parts, segments, self.common, (low, high, scale))
 
-    def _data(self) -> dict[str, Array]:
+    def _data(self) -> dict[str, Any]:
         """Times and disturbances at the ends and middles of all steps of every segment."""
         per = 2 * self.method.pieces * self.method.steps
         count, scenarios = self.method.segments, self.layout.scenarios
@@ -223,7 +224,7 @@ class Shooting:
             "scenario": np.repeat(np.arange(scenarios), count),
         }
 
-    def _joints(self, first: Array, scale: Array) -> constraints.Part:
+    def _joints(self, first: IntArray, scale: Array) -> constraints.Part:
         """The end of a segment is the start of the next."""
         x = self.layout.columns[0][:, self.layout.state_nodes]
         nx = self.functions.nx
@@ -238,7 +239,7 @@ class Shooting:
         zeros, size = np.zeros(index.size), scale[x[:, 1:]].ravel()
         return constraints.Part(zeros, zeros, size, rows, linear, node)
 
-    def _inner_bounds(self, first: Array, scale: Array) -> constraints.Part:
+    def _inner_bounds(self, first: IntArray, scale: Array) -> constraints.Part:
         """Bounds of states at nodes inside the segments."""
         layout, nx, pieces = self.layout, self.functions.nx, self.method.pieces
         x = layout.columns[0]
@@ -264,7 +265,7 @@ class Shooting:
         node = constraints.entries(np.arange(count), columns, np.ones(count))
         return constraints.Part(joined(low), joined(high), joined(size), rows, node=node)
 
-    def _path_source(self, first: Array) -> Array:
+    def _path_source(self, first: IntArray) -> IntArray:
         """First path output of every node: of the segment that it ends, or begins at the start."""
         pieces = self.method.pieces
         width = sum(self.functions.path_sizes.values())

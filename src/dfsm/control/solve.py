@@ -101,7 +101,12 @@ def solve(
         errors = shot.errors(start)
         record.add(shot, outcome, float(errors.max()))
         done = refine is None or errors.max() <= refine or grid.intervals > _MOST_INTERVALS
-        if done or round_ == rounds or outcome.ending not in ("solved", "acceptable"):
+        if (
+            done
+            or refine is None
+            or round_ == rounds
+            or outcome.ending not in ("solved", "acceptable")
+        ):
             break
         old, grid = grid, grid.refined(errors, refine)
         start = replace(
@@ -281,7 +286,9 @@ def trajectories_of(
     time = problem.start + tau * (start.stop - problem.start)
     p = np.array(list(parameters_of(problem, start).values()))
     count = len(problem.scenarios)
-    w = node_data(problem, tau, time)["w"].reshape(count, len(tau), len(plant.names("disturbances")))
+    w = node_data(problem, tau, time)["w"].reshape(
+        count, len(tau), len(plant.names("disturbances"))
+    )
     roles: dict[str, Role] = {
         "states": "state",
         "controls": "control",

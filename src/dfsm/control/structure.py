@@ -1,4 +1,4 @@
-"""Whether traced code depends on its first argument: how linear-quadratic problems are recognised."""
+"""Whether traced code depends on an argument: how linear-quadratic problems are recognised."""
 
 from __future__ import annotations
 

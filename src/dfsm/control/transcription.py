@@ -9,6 +9,7 @@ Ch. 4). Which scheme it is only enters through the matrices of the `Grid`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -218,7 +219,7 @@ class Transcription:
         return self.program.scale[self.layout.columns[0][0, 0]]
 
 
-def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Array]:
+def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Any]:
     """What every node of every scenario is given: its time and its disturbances."""
     names = problem.plant.names("disturbances")
     count = len(problem.scenarios)
