@@ -50,7 +50,9 @@ class Term:
         rows = (0, 0, None)
         self.parts = parts
         self._values = jax.jit(jax.vmap(function, rows))
-        self._jacobian = jax.jit(jax.vmap(jax.jacfwd(function), rows))
+        # Measured: backwards a third of the time for hundreds of units; forwards through loops.
+        slopes = jax.jacfwd if parts is None else jax.jacrev
+        self._jacobian = jax.jit(jax.vmap(slopes(function), rows))
         self._hessian = jax.jit(jax.vmap(jax.jacfwd(jax.grad(weighted)), (*rows, 0)))
 
     def values(self, z: Array, data: Any, common: Any) -> Array:

@@ -100,13 +100,9 @@ def solve(
         start = shot.unscaled(outcome.z)
         errors = shot.errors(start)
         record.add(shot, outcome, float(errors.max()))
-        done = refine is None or errors.max() <= refine or grid.intervals > _MOST_INTERVALS
-        if (
-            done
-            or refine is None
-            or round_ == rounds
-            or outcome.ending not in ("solved", "acceptable")
-        ):
+        if refine is None or errors.max() <= refine or grid.intervals > _MOST_INTERVALS:
+            break
+        if round_ == rounds or outcome.ending not in ("solved", "acceptable"):
             break
         old, grid = grid, grid.refined(errors, refine)
         start = replace(
