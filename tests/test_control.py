@@ -15,7 +15,9 @@ from dfsm.control import (
     MultipleShooting,
     OptimalControlProblem,
     SingleShooting,
+    load_solution,
     program,
+    save_solution,
     solve,
 )
 from dfsm.errors import DfsmError
@@ -322,6 +324,44 @@ def test_interrupt_returns_the_best_iterate(monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
     monkeypatch.undo()
     assert solve(hard, QUICK, found, simulate=False).solved
+
+
+# -- storage ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [QUICK, MultipleShooting(segments=5, pieces=4)])
+def test_a_solution_is_saved_and_loaded(tmp_path, method):
+    given = problem(bounds={"force": (-1.45, 1.45)})
+    found = solved(given, method, simulate=True)
+    save_solution(found, tmp_path / "s")
+    loaded = load_solution(tmp_path / "s")
+    assert loaded.summary() == found.summary()
+    assert repr(loaded) == repr(found)
+    for name in ("trajectories", "costates"):
+        for a, b in zip(getattr(loaded, name), getattr(found, name), strict=True):
+            assert a.channels == b.channels
+            np.testing.assert_array_equal(a.values, b.values)
+    np.testing.assert_array_equal(
+        loaded.replays[0].trajectory.values, found.replays[0].trajectory.values
+    )
+    np.testing.assert_array_equal(loaded.multipliers["force"], found.multipliers["force"])
+    again = solved(given, method, guess=loaded)
+    assert again.objective == pytest.approx(found.objective, rel=1e-7)
+    save_solution(found, tmp_path / "s")  # replaces it
+
+
+def test_a_folder_that_is_no_solution(tmp_path):
+    with pytest.raises(DfsmError, match="is no folder of a solution"):
+        load_solution(tmp_path / "nothing")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").touch()
+    found = solved(problem())
+    with pytest.raises(DfsmError, match="not a folder that dfsm wrote"):
+        save_solution(found, tmp_path / "other")
+    save_solution(found, tmp_path / "s")
+    (tmp_path / "s" / "solution.safetensors").write_bytes(b"x")
+    with pytest.raises(DfsmError, match=r"is damaged: solution\.safetensors is not the file"):
+        load_solution(tmp_path / "s")
 
 
 # -- bad input ----------------------------------------------------------------------------------

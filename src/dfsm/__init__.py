@@ -14,6 +14,16 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dfsm.config import load_config
+    from dfsm.control import (
+        DirectTranscription,
+        MultipleShooting,
+        OptimalControlProblem,
+        SingleShooting,
+        Solution,
+        load_solution,
+        save_solution,
+        solve,
+    )
     from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
     from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.errors import DfsmError, DfsmWarning
@@ -103,6 +113,14 @@ _HOME = {
     "Validation": "validate",
     "compared": "validate",
     "validate": "validate",
+    "OptimalControlProblem": "control",
+    "DirectTranscription": "control",
+    "MultipleShooting": "control",
+    "SingleShooting": "control",
+    "solve": "control",
+    "Solution": "control",
+    "save_solution": "control",
+    "load_solution": "control",
     "write_report": "report",
     "load_config": "config",
 }

@@ -9,6 +9,7 @@ from dfsm.control.shooting import MultipleShooting, SingleShooting
 from dfsm.control.signals import End, Signals
 from dfsm.control.solution import Ending, Replay, Solution
 from dfsm.control.solve import solve
+from dfsm.control.storage import load_solution, save_solution
 from dfsm.control.transcription import DirectTranscription
 
 __all__ = [
@@ -21,5 +22,7 @@ __all__ = [
     "Signals",
     "SingleShooting",
     "Solution",
+    "load_solution",
+    "save_solution",
     "solve",
 ]
