@@ -303,6 +303,14 @@ def test_a_mesh_that_stays_too_coarse_is_said_to_be():
     assert [m["intervals"] for m in found.meshes] == [5, 20]
 
 
+def test_the_solver_steps_back_where_a_function_is_not_defined(capfd):
+    # The force that a path in 3 s needs is close to where the logarithm ends.
+    tight = problem(horizon=(0.0, 3.0), cost=lambda s: -jnp.log(2.8 - s.u.force))
+    found = solved(tight)
+    assert 2.0 < found.trajectory["force"].max() < 2.8
+    assert capfd.readouterr() == ("", "")
+
+
 def test_interrupt_returns_the_best_iterate(monkeypatch):
     calls = []
     original = program.Program.hessian

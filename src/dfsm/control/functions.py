@@ -21,8 +21,9 @@ from dfsm.control.structure import varies
 from dfsm.errors import DfsmError
 from dfsm.types import Array
 
-# Rows are padded to one of few lengths, so that most meshes of a problem share a compilation.
-_FEW, _SMALL, _STEP = 8, (128, 512), 512
+# Rows are evaluated in blocks of few lengths: all meshes of a problem share a compilation, and what
+# hundreds of units need for derivatives stays in the cache.
+_FEW, _SIZES = 8, (128, 256)
 
 # Compiled functions of this many problems are kept.
 _MOST = 32
@@ -82,23 +83,23 @@ class Term:
     @staticmethod
     def _padded(function: Callable[..., jax.Array], common: Any, z: Array, *rest: Any) -> Array:
         count = len(z)
-        extra = padded_length(count) - count
+        size = block_length(count)
+        extra = -count % size
 
         def pad(a: Array) -> Array:
             return np.concatenate([a, np.repeat(a[-1:], extra, axis=0)]) if extra else a
 
-        z, data, *weights = jax.tree.map(pad, (z, *rest))
-        return np.asarray(function(z, data, common, *weights))[:count]
+        padded = jax.tree.map(pad, (z, *rest))
+        found = []
+        for first in range(0, count, size):
+            part = jax.tree.map(lambda a, k=first: a[k : k + size], padded)
+            found.append(np.asarray(function(part[0], part[1], common, *part[2:])))
+        return (found[0] if len(found) == 1 else np.concatenate(found))[:count]
 
 
-def padded_length(count: int) -> int:
-    """Number of rows that `count` rows are padded to."""
-    if count <= _FEW:
-        return count
-    for length in _SMALL:
-        if count <= length:
-            return length
-    return -(-count // _STEP) * _STEP
+def block_length(count: int) -> int:
+    """Number of rows that are evaluated at once, of `count`."""
+    return count if count <= _FEW else next((n for n in _SIZES if count <= n), _SIZES[-1])
 
 
 # -- the functions of a problem -----------------------------------------------------------------

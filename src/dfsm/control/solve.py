@@ -38,6 +38,8 @@ _ENDINGS = {
 
 # Objectives that are smaller than 1 by this factor are scaled up, by no more than the second.
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
+# Scaled violations up to which a start counts as close to a solution.
+_NEAR = 1e-2
 # Meshes are not refined beyond this many intervals.
 _MOST_INTERVALS = 5000
 
@@ -95,6 +97,9 @@ def solve(
         shot.program.objective_scale = record.objective_scale
         _prepare(shot, z)
         record.compile += clock.perf_counter() - begin
+        warm = (warm or round_ > 0) and _is_near(shot, start)
+        if not warm:
+            multipliers = None
         options = NlpOptions(method.tolerance, method.most_iterations, warm)
         outcome = _solve_scaled(shot.program, z, options, multipliers)
         start = shot.unscaled(outcome.z)
@@ -110,9 +115,20 @@ def solve(
             X=np.stack([old.states(X, grid.tau) for X in start.X]),
             U=np.stack([old.controls(U, grid.tau) for U in start.U]),
         )
-        warm, multipliers = True, None
+        multipliers = None
     record.coarse = refine is not None and not record.error <= refine
     return _solution(problem, record, start, simulate)
+
+
+def _is_near(shot: Shot, start: Start) -> bool:
+    """Whether a start nearly meets all bounds and constraints.
+
+    Staying close to one that does not costs several times the iterations of starting afresh from
+    its states and controls.
+    """
+    program, z = shot.program, shot.scaled(start)
+    moved = np.abs(shot.layout.pack(start) / program.scale - z).max(initial=0.0)
+    return max(float(moved), worst_violation(program, z)) < _NEAR
 
 
 def _prepare(shot: Shot, z: Array) -> None:
