@@ -1,6 +1,6 @@
 """Run the measurements and print one JSON object.
 
-python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [control]
+python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [control]
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import platform
 import warnings
 
 import dfsm
-from benchmarks import accuracy, control, derivatives, parameters, speed
+from benchmarks import accuracy, control, derivatives, parameters, scaling, speed
 from dfsm.files import json_value
 
 PARTS = {
@@ -20,6 +20,7 @@ PARTS = {
     "accuracy": accuracy.run,
     "speed": speed.run,
     "parameters": parameters.run,
+    "scaling": scaling.run,
     "control": control.run,
 }
 

@@ -1,4 +1,4 @@
-"""Write the tables of the README and of docs/method.md from measurements.
+"""Write the tables of the README and of docs/method.md, and its figure, from measurements.
 
 python -m benchmarks > figures.json && python -m benchmarks.readme figures.json
 """
@@ -87,27 +87,65 @@ def parameters_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def scaling_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors, then costs: a row per kind, a column per number of inputs."""
+    heads = [f"{found['inputs']} inputs" for found in figures.values()]
+    kinds = list(next(iter(figures.values()))["results"])
+    lines: list[str] = []
+    for what, cell in (
+        ("error, f̂ / rollout", _scaling_errors),
+        ("cost, training / evaluation", _scaling_costs),
+    ):
+        lines += [f"| {what} | {' | '.join(heads)} |", "|---|" + "---|" * len(heads)]
+        for kind in kinds:
+            cells = [cell(found["results"][kind]) for found in figures.values()]
+            lines.append(f"| {kind} | {' | '.join(cells)} |")
+        lines.append("")
+    return lines[:-1]
+
+
+def _scaling_errors(found: Mapping[str, Any]) -> str:
+    rollout = "–" if found["rollout"] is None else f"{100 * found['rollout']:.2g} %"
+    return f"{100 * found['derivative']:.2g} % / {rollout}"
+
+
+def _scaling_costs(found: Mapping[str, Any]) -> str:
+    seconds, ratio = found["training_s"], found["evaluation_ratio"]
+    training = f"{seconds:.0f} s" if seconds >= 1 else f"{seconds:.1g} s"
+    return f"{training} / " + ("–" if ratio is None else f"{ratio:.2g} ×")
+
+
 TABLES = {
     "accuracy": accuracy_table,
     "speed": speed_table,
     "derivatives": derivatives_table,
     "parameters": parameters_table,
+    "scaling": scaling_table,
 }
 
 
+def fill(path: Path, tables: Mapping[str, list[str]]) -> None:
+    """Put a table between ``<!-- name -->`` and ``<!-- end -->``, wherever that stands."""
+    text = path.read_text(encoding="utf-8")
+    for name, lines in tables.items():
+        mark = f"<!-- {name} -->"
+        if mark in text:
+            head, rest = text.split(mark, 1)
+            tail = rest.split("<!-- end -->", 1)[1]
+            text = "\n".join([head + mark, *lines, "<!-- end -->" + tail])
+    path.write_text(text, encoding="utf-8")
+
+
 def main() -> None:
-    """Replace what stands between ``<!-- name -->`` and ``<!-- end -->``."""
+    """Write the tables that the figures hold."""
     figures = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    tables = {name: table(figures[name]) for name, table in TABLES.items() if name in figures}
     for path in FILES:
-        text = path.read_text(encoding="utf-8")
-        for name, table in TABLES.items():
-            mark = f"<!-- {name} -->"
-            if name in figures and mark in text:
-                head, rest = text.split(mark, 1)
-                tail = rest.split("<!-- end -->", 1)[1]
-                lines = "\n".join(table(figures[name]))
-                text = f"{head}{mark}\n{lines}\n<!-- end -->{tail}"
-        path.write_text(text, encoding="utf-8")
+        fill(path, tables)
+    if "scaling" in figures:
+        from benchmarks.scaling_figure import draw  # only this needs Matplotlib
+
+        draw(figures["scaling"], ROOT / "docs" / "figures" / "scaling.svg")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fit import fit
 from dfsm.linear import LTI
 from dfsm.parametrise import Parametrisation
-from dfsm.refine import RefineSettings, _record, _RolloutError, refine
+from dfsm.refine import RefineSettings, refine
+from dfsm.rollout_error import RolloutError, record_of
 from dfsm.samples import FitSettings
 from dfsm.simulate import simulate
 from dfsm.storage import load
@@ -121,9 +122,9 @@ def test_the_seed_decides_which_runs_are_held_out(runs, biased):
 
 
 def test_slopes_agree_with_differences(runs, biased):
-    record = _record(biased, runs[0], 0.1, 0.0, 20.0)
+    record = record_of(biased, runs[0], 0.1, 0.0, 20.0)
     parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
-    problem = _RolloutError(parameters, [record], 5.0, np.ones(2))
+    problem = RolloutError(parameters, [record], 5.0, np.ones(2))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     JtJ, Jtr = problem.normal_equations(at)
     assert JtJ.shape == (parameters.size, parameters.size)

@@ -64,10 +64,11 @@ def test_the_change_is_the_cheapest_one() -> None:
     stable, _ = stabilise(plain, COLUMNS, KNOWN, margin, affine=True)
     variance = plain.residual_rms**2
 
+    columns = range(COLUMNS.start, COLUMNS.stop)
+
     def cost(fixed: Array) -> float:
-        return float(
-            np.sum(plain.equations[0].complete(COLUMNS, fixed.reshape(2, 4), True)[2] / variance)
-        )
+        found = plain.equations[0].complete(columns, fixed.reshape(2, 4), True)
+        return float(np.sum(found[2] / variance))
 
     def room(fixed: Array) -> float:
         L = np.zeros((2, 6))

@@ -90,6 +90,16 @@ def test_a_correction_helps_and_leaves_linear_rows_alone(quick):
     assert multi.rollouts.completed == len(multi.rollouts.errors) == 20
 
 
+def test_the_documentation_states_the_sweep(quick):
+    text = (EXAMPLE.parents[1] / "docs" / "two-link-robot.md").read_text(encoding="utf-8")
+    block = text.split("<!-- sweep -->")[1].split("<!-- end -->")[0]
+    stated = {row.split(" | ")[0].strip("| "): row.split(" | ")[4:] for row in block.splitlines()}
+    sweep = quick.multi_fidelity.sweep
+    for n, a, b in zip(sweep.samples, sweep.found[MULTI], sweep.found[NONLINEAR], strict=True):
+        errors = np.stack([a.rollouts.rmse, b.rollouts.rmse], axis=1).ravel()
+        assert [float(c.strip(" |")) for c in stated[str(n)]] == pytest.approx(errors, rel=0.05)
+
+
 def test_the_published_program_is_beaten_in_every_state(quick):
     for fitted in quick.kinds.values():
         assert fitted.short.rollouts.completed == fitted.long.completed == 20

@@ -86,18 +86,13 @@ def fit(
     """Fit a multi-fidelity model and save it as a folder."""
     from dfsm.config import load_config
     from dfsm.fit import fit as run_fit
-    from dfsm.refine import refine
     from dfsm.storage import check_target, save
 
     check_target(output)
     with _working(quiet):
         settings, runs = load_config(config)
-        choices = settings.fit_settings()
-        result = run_fit(runs, choices)
+        result = run_fit(runs, settings.fit_settings(), settings.refine)
         model = result.model
-        if settings.refine is not None:
-            window = {"start": choices.start, "stop": choices.stop}
-            model = refine(model, runs, settings.refine, **window, seed=choices.seed).model
     replaced = output.exists() and any(output.iterdir())
     save(model, output, result.nonlinear)
     if replaced and not quiet:

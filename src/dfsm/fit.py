@@ -1,7 +1,8 @@
 """The method, step by step: runs in, a multi-fidelity DFSM out (Sec. 3.1).
 
 Read `fit` from top to bottom: select the channels, take derivatives, fit linearly, look at what is
-left, correct where that is worth it, do the same for the outputs, check the result.
+left, correct where that is worth it, refine on rollouts if asked for, do the same for the outputs,
+check the result.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from dfsm.derivatives import kinematic_rows
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
 from dfsm.model import DFSM
+from dfsm.refine import RefineSettings, refine
+from dfsm.rollout_samples import along_rollouts, with_latents
 from dfsm.samples import FitSettings, Samples, data_warnings, extract, select
 from dfsm.signals import Provenance, Region
 from dfsm.simulate import Status, simulate
@@ -63,7 +66,9 @@ class FitResult:
 # Threads gain next to nothing on matrices this narrow, and where other programs use the machine
 # they wait for each other: measured five times slower on two loaded cores.
 @threadpool_limits.wrap(limits=1)
-def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
+def fit(
+    runs: Iterable[Trajectory], choices: FitSettings, refinement: RefineSettings | None = None
+) -> FitResult:
     """Fit a multi-fidelity derivative function surrogate model.
 
     Parameters
@@ -72,6 +77,9 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
         Simulations that hold all channels named in `choices`; their order does not matter.
     choices
         Signals and settings.
+    refinement
+        How the derivative function is refined on rollouts, see `refine`; None leaves it as
+        fitted. Outputs are then fitted along the refined model's own rollouts.
 
     Returns
     -------
@@ -95,22 +103,35 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
         samples = extract(data, choices)
     with _timed(seconds, "linear fit"):
         f = _fit_derivatives(samples, choices)
-        g = _fit_outputs(samples, choices)
     with _timed(seconds, "corrective functions"):
         e = correct(samples, samples.inputs, samples.derivatives, f, choices)
-        e_g = correct(samples, _output_inputs(samples), samples.outputs, g, choices) if g else None
     model = DFSM(
         f=f.model,
         e=e.function,
-        g=g.model if g else None,
-        e_g=e_g.function if e_g else None,
+        g=None,
+        e_g=None,
         region=_region(samples, f.model, data),
         corrected=e.rows,
-        corrected_outputs=e_g.rows if e_g else (),
+        corrected_outputs=(),
         signals=samples.signals,
     )
     if choices.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
+    seen = samples
+    if refinement is not None:
+        with _timed(seconds, "refinement"):
+            window = {"start": choices.start, "stop": choices.stop}
+            model = refine(model, data, refinement, **window, seed=choices.seed).model
+            seen = along_rollouts(model, data, samples, choices)
+    with _timed(seconds, "outputs"):
+        g = _fit_outputs(seen, choices)
+        e_g = correct(seen, _output_inputs(seen), seen.outputs, g, choices) if g else None
+    model = replace(
+        model,
+        g=g.model if g else None,
+        e_g=e_g.function if e_g else None,
+        corrected_outputs=e_g.rows if e_g else (),
+    )
     with _timed(seconds, "checks"):
         notes, checks = _check(model, samples, data, choices)
     notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
@@ -120,7 +141,9 @@ def fit(runs: Iterable[Trajectory], choices: FitSettings) -> FitResult:
         with _timed(seconds, "nonlinear-only"):
             nonlinear = _fit_nonlinear(samples, model.region, choices)
     decisions = [*e.decisions, *(e_g.decisions if e_g else [])]
-    record = _record(data, choices, f, decisions, notes, checks, seconds)
+    record = dict(model.provenance.record) | _record(
+        data, choices, f, decisions, notes, checks, seconds
+    )
     for text in notes:
         warnings.warn(text, DfsmWarning, stacklevel=2)
     model = replace(model, provenance=Provenance(record))
@@ -263,7 +286,7 @@ def _check(
 ) -> tuple[list[str], list[str]]:
     """Look for what would surprise a user: non-finite values, instability, leaking disturbances."""
     notes = data_warnings(data, choices)
-    x, u, w, p = model.split(samples.inputs)
+    x, u, w, p = model.split(with_latents(model, data, samples, choices).inputs)
     values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
     if not np.isfinite(values).all():
         raise DfsmError(

@@ -214,24 +214,30 @@ def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = n
     Array
         States at the ends of all steps, ``(step + 1, state)``.
     """
-    n_uw = len(model.signals.controls) + len(model.signals.disturbances)
-    columns = slice(n_uw, n_uw + len(model.signals.states))
-    low, high = model.region.low[columns], model.region.high[columns]
-    middle, reach = (low + high) / 2, (high - low) / 2 * bound
+    low, high = clip_range(model, bound)
 
     def step(x: jax.Array, drive: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
         dt, v0, vm, v1 = drive
-        k1 = _slope(model, x, v0)
-        k2 = _slope(model, x + 0.5 * dt * k1, vm)
-        k3 = _slope(model, x + 0.5 * dt * k2, vm)
-        k4 = _slope(model, x + dt * k3, v1)
+        k1 = rate(model, x, v0)
+        k2 = rate(model, x + 0.5 * dt * k1, vm)
+        k3 = rate(model, x + 0.5 * dt * k2, vm)
+        k4 = rate(model, x + dt * k3, v1)
         x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         if np.isfinite(bound):
-            x = jnp.clip(x, middle - reach, middle + reach)
+            x = jnp.clip(x, low, high)
         return x, x
 
     _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
     return jnp.concatenate([x0[None], xs])
+
+
+def clip_range(model: DFSM, bound: float) -> tuple[jax.Array, jax.Array]:
+    """Lowest and highest states within `bound` training half-ranges of the range's middle."""
+    n_uw = len(model.signals.driving)
+    columns = slice(n_uw, n_uw + len(model.signals.states))
+    low, high = model.region.low[columns], model.region.high[columns]
+    middle, reach = (low + high) / 2, (high - low) / 2 * bound
+    return middle - reach, middle + reach
 
 
 def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -240,7 +246,8 @@ def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, j
     return v[..., :n_u], v[..., n_u : n_u + n_w], v[..., n_u + n_w :]
 
 
-def _slope(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
+def rate(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
+    """f̂ at states ``(state,)`` and exogenous inputs ``(exogenous,)``."""
     return model.derivative(x, *exogenous_groups(model, v))
 
 
@@ -310,10 +317,10 @@ def _adapt(
     import diffrax
 
     path = diffrax.LinearInterpolation(jnp.asarray(time), jnp.asarray(inputs))
-    n_uw = len(model.signals.controls) + len(model.signals.disturbances)
+    n_uw = len(model.signals.driving)
     spread = model.region.std[n_uw : n_uw + len(model.signals.states)]
     spread = jnp.where(spread > 0, spread, 1.0)
-    term = diffrax.ODETerm(lambda t, z, _: _slope(model, z * spread, path.evaluate(t)) / spread)
+    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, path.evaluate(t)) / spread)
     samples = jnp.asarray(time[:: 2 * every])
     solution = diffrax.diffeqsolve(
         term,

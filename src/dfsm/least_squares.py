@@ -66,7 +66,9 @@ class NormalEquations:
         offset = self.sums / self.count
         return np.sqrt(np.maximum(np.diag(self.products) / self.count - offset**2, 0.0))
 
-    def solve(self, affine: bool, prior: Solution | None = None) -> Solution:
+    def solve(
+        self, affine: bool, prior: Solution | None = None, held: Sequence[int] = ()
+    ) -> Solution:
         """Solve for the coefficients.
 
         Parameters
@@ -77,10 +79,12 @@ class NormalEquations:
             A fit over more data, whose coefficients hold in directions that these samples hardly
             excite (a torque at its limit, say). None takes the solution of minimum norm in the
             standardised inputs.
+        held
+            Inputs whose coefficients are those of the prior.
         """
         mean, products = self.moments(centred=affine)
         if prior is not None:
-            return self._lean_on(prior, self.solve(affine), mean, products)
+            return self._lean_on(prior, self.solve(affine), mean, products, held)
         m = self.n_inputs
         scale = np.sqrt(np.maximum(np.diag(products)[:m], 0.0))
         # A column that does not vary gets no coefficient; any scale but zero will do.
@@ -107,7 +111,9 @@ class NormalEquations:
             directions=V,
         )
 
-    def _lean_on(self, prior: Solution, own: Solution, mean: Array, products: Array) -> Solution:
+    def _lean_on(
+        self, prior: Solution, own: Solution, mean: Array, products: Array, held: Sequence[int]
+    ) -> Solution:
         """Ridge towards `prior`, weighted by its input variances.
 
         The weight is the share of the target that these samples' `own` fit leaves over, so that
@@ -119,11 +125,14 @@ class NormalEquations:
         target_variance = np.maximum(np.diag(products)[m:], np.finfo(float).tiny)
         share = np.minimum(own.residual_variance / target_variance, 1.0)
         weight = share * min(1.0, _CORRELATED / self.count)
-        pull = np.diag(prior.input_variance)
-        L = np.empty_like(prior.coefficients)
+        given = np.array(held, dtype=int)
+        free = np.delete(np.arange(m), given)
+        pull = np.diag(prior.input_variance[free])
+        L = prior.coefficients.copy()
         for t, w in enumerate(np.maximum(weight, 1e-12)):
-            A, b = Q + w * pull, right[:, t] + w * pull @ prior.coefficients[t]
-            L[t] = np.linalg.lstsq(A, b, rcond=None)[0]
+            rest = right[free, t] - Q[np.ix_(free, given)] @ L[t, given]
+            A, b = Q[np.ix_(free, free)] + w * pull, rest + w * pull @ prior.coefficients[t, free]
+            L[t, free] = np.linalg.lstsq(A, b, rcond=None)[0]
         rss = np.diag(products)[m:] - np.einsum("ij,ji->j", 2 * right - Q @ L.T, L)
         return replace(
             prior,
@@ -148,7 +157,9 @@ class NormalEquations:
         partial = partial + 1e-9 * np.eye(len(partial))
         return partial * np.outer(scale[columns], scale[columns])
 
-    def complete(self, columns: slice, fixed: Array, affine: bool) -> tuple[Array, Array, Array]:
+    def complete(
+        self, columns: Sequence[int], fixed: Array, affine: bool
+    ) -> tuple[Array, Array, Array]:
         """Best remaining coefficients when those of some inputs are given.
 
         Parameters
@@ -169,11 +180,11 @@ class NormalEquations:
         m = self.n_inputs
         Q, right = products[:m, :m], products[:m, m:]
         free = np.ones(m, dtype=bool)
-        free[columns] = False
+        free[list(columns)] = False
         scale = np.sqrt(np.maximum(np.diag(Q)[free], np.finfo(float).tiny))
-        rest = (right - Q[:, columns] @ fixed.T)[free] / scale[:, None]
+        rest = (right - Q[:, list(columns)] @ fixed.T)[free] / scale[:, None]
         L = np.empty((len(fixed), m))
-        L[:, columns] = fixed
+        L[:, list(columns)] = fixed
         solved = np.linalg.lstsq(Q[np.ix_(free, free)] / np.outer(scale, scale), rest, rcond=1e-9)[
             0
         ]
@@ -200,6 +211,12 @@ class Solution:
         low = self.eigenvalues[0]
         return float(np.sqrt(self.eigenvalues[-1] / low)) if low > 0 else float("inf")
 
+    def holding(self, columns: Sequence[int], coefficients: Array) -> Solution:
+        """The same with other coefficients of some inputs, ``(target, len(columns))``."""
+        changed = self.coefficients.copy()
+        changed[:, list(columns)] = coefficients
+        return replace(self, coefficients=changed)
+
     def confounded(self, names: list[str]) -> list[str]:
         """Name the inputs that dominate the direction in which the data hardly vary."""
         weight = np.abs(self.directions[:, 0])
@@ -214,3 +231,39 @@ def merge(parts: Sequence[NormalEquations]) -> NormalEquations:
         total.sums += part.sums
         total.products += part.products
     return total
+
+
+def shared_coefficients(
+    parts: Sequence[NormalEquations], columns: Sequence[int], affine: bool
+) -> Array:
+    """Least-squares coefficients of some inputs that all parts share; the others are free in each.
+
+    Parameters
+    ----------
+    parts
+        Sums over the samples of each part.
+    columns
+        The inputs in question.
+    affine
+        Every part has an offset of its own.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(target, len(columns))``.
+    """
+    m = parts[0].n_inputs
+    some = np.array(columns, dtype=int)
+    rest = np.delete(np.arange(m), some)
+    left = np.zeros((len(some), len(some)))
+    right = np.zeros((len(some), len(parts[0].shift) - m))
+    for part in parts:
+        _, products = part.moments(centred=affine)
+        scale = np.sqrt(np.maximum(np.diag(products)[rest], np.finfo(float).tiny))
+        inner = products[np.ix_(rest, rest)] / np.outer(scale, scale)
+        # What the free inputs explain is taken out of both sides (Frisch, Waugh and Lovell).
+        out = np.linalg.lstsq(inner, products[rest][:, some] / scale[:, None], rcond=1e-9)[0]
+        out = out / scale[:, None]
+        left += part.count * (products[np.ix_(some, some)] - out.T @ products[rest][:, some])
+        right += part.count * (products[some, m:] - out.T @ products[rest, m:])
+    return np.linalg.lstsq(left, right, rcond=None)[0].T

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import dfsm.jax_setup  # noqa: F401
-from dfsm.errors import DfsmError
-from dfsm.least_squares import BLOCK, NormalEquations, Solution, merge
+from dfsm.errors import DfsmError, near_matches
+from dfsm.least_squares import BLOCK, NormalEquations, Solution, merge, shared_coefficients
 from dfsm.settings import settings
 from dfsm.types import Array, IntArray
 
@@ -58,6 +58,9 @@ class LPV:
         The disturbance (or other input) that the coefficients depend on, e.g. the wind speed.
     points
         Number of windows, at least 2.
+    constant
+        Inputs whose coefficients are the same at all points, where physics says so: a torque
+        changes a speed by one over the inertia, whatever the wind.
     affine
         Fit an offset in every window.
     margin
@@ -67,6 +70,7 @@ class LPV:
     kind: Literal["LPV"] = "LPV"
     schedule: str
     points: int = 5
+    constant: tuple[str, ...] = ()
     affine: bool = True
     margin: float | None = None
 
@@ -108,6 +112,16 @@ class LinearModel(eqx.Module):
         b = jax.lax.dynamic_slice_in_dim(self.offsets, i, 2)
         return (1 - t) * L[0] + t * L[1], (1 - t) * b[0] + t * b[1]
 
+    def shares(self, inputs: jax.Array) -> jax.Array:
+        """Weight of every schedule point at one input vector, shape ``(point,)``."""
+        if self.schedule is None:
+            return jnp.ones(1)
+        grid = self.grid
+        value = jnp.clip(inputs[self.schedule], grid[0], grid[-1])
+        after = jnp.clip((value - grid[:-1]) / jnp.diff(grid), 0.0, 1.0)
+        one = jnp.ones(1)
+        return jnp.concatenate([one, after]) - jnp.concatenate([after, 0 * one])
+
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
         L, b = self.at(inputs[self.schedule] if self.schedule is not None else 0.0)
@@ -133,6 +147,8 @@ class LinearFit:
         Condition number of the standardised inputs over all windows.
     equations
         The sums behind every schedule point.
+    constant
+        Input columns whose coefficients are the same at all schedule points by choice.
     warnings
         Sentences that name inputs which do not vary or which the data cannot tell apart.
     notes
@@ -147,6 +163,7 @@ class LinearFit:
     condition: float
     equations: tuple[NormalEquations, ...]
     warnings: tuple[str, ...]
+    constant: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -238,7 +255,10 @@ def fit_linear(
             schedule_sums[k] += s[inside].sum()
     _check_counts(sums, windows, choice)
     whole = merge(sums).solve(choice.affine)
-    solutions = [e.solve(choice.affine, whole) for e in sums] if lpv else [whole]
+    constant = _constant(choice, input_names)
+    if constant:
+        whole = whole.holding(constant, shared_coefficients(sums, constant, choice.affine))
+    solutions = [e.solve(choice.affine, whole, constant) for e in sums] if lpv else [whole]
     counts = np.array([e.count for e in sums])
     grid = schedule_sums / counts if lpv else np.zeros(1)
     model = LinearModel(
@@ -259,7 +279,20 @@ def fit_linear(
         condition=whole.condition,
         equations=tuple(sums),
         warnings=_warnings(whole, input_names),
+        constant=constant,
     )
+
+
+def _constant(choice: LTI | LPV, names: Sequence[str]) -> tuple[int, ...]:
+    if not isinstance(choice, LPV):
+        return ()
+    unknown = [n for n in choice.constant if n not in names]
+    if unknown:
+        raise DfsmError(
+            f"linear.constant names '{unknown[0]}', which is not an input of the model; "
+            + near_matches(unknown[0], names)
+        )
+    return tuple(list(names).index(n) for n in choice.constant)
 
 
 def _check_counts(sums: Sequence[NormalEquations], windows: Array, choice: LTI | LPV) -> None:

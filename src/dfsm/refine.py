@@ -14,29 +14,25 @@ of the training decide when to stop, and a model that is no better on them is no
 
 from __future__ import annotations
 
-import os
 import time as clock
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
-from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.filters import moving_average
-from dfsm.integrate import rk4
+from dfsm.latent_start import start_latents
+from dfsm.latents import with_latent_range
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.progress import track
+from dfsm.rollout_error import RolloutError, record_of
 from dfsm.settings import require, settings
-from dfsm.signals import Provenance, with_computed
+from dfsm.signals import Provenance
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.types import Array
 
@@ -44,9 +40,6 @@ from dfsm.types import Array
 _PATIENCE = 6
 # Damping at the start of a stage, relative to the mean curvature.
 _DAMPING = 1e-3
-# A rollout that leaves the training range this many half-ranges from its middle is cut off there:
-# the error stays finite and still has a slope.
-_FAR = 30.0
 
 
 @settings
@@ -59,6 +52,8 @@ class RefineSettings:
         Lengths of the rollouts in s, one stage after the other; None is a whole run.
     step
         Integration step in s; inputs are averaged over it.
+    latents
+        Number of latent states to add to a model that has none, an even number, see `latents.py`.
     iterations
         Largest number of Levenberg-Marquardt steps per stage.
     hold_out
@@ -72,6 +67,7 @@ class RefineSettings:
     windows: tuple[float | None, ...] = (20.0, 100.0, None)
     step: float = 0.25
     iterations: int = 20
+    latents: int = 0
     hold_out: float = 0.2
     weights: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
@@ -82,6 +78,8 @@ class RefineSettings:
             good = length is None or length > self.step
             require(good, "refine.windows", length, "lengths in s, longer than refine.step")
         require(self.step > 0, "refine.step", self.step, "more than 0 s")
+        even = self.latents >= 0 and self.latents % 2 == 0
+        require(even, "refine.latents", self.latents, "an even number: they come in pairs")
         require(self.iterations >= 1, "refine.iterations", self.iterations, "at least 1")
         require(0 < self.hold_out < 1, "refine.hold_out", self.hold_out, "a share between 0 and 1")
         for name, weight in self.weights.items():
@@ -130,7 +128,7 @@ def refine(
     ----------
     model
         Where to start: all coefficients of its derivative function may change, linear and
-        corrective ones; kinematic rows and outputs stay.
+        corrective ones and the dynamics of latent states; kinematic rows and outputs stay.
     runs
         Training runs; some of them are held out to decide when to stop.
     choices
@@ -158,70 +156,42 @@ def refine(
     choices = choices or RefineSettings()
     training, validation = Dataset(runs).split(choices.hold_out, seed)
     weights = _weights(model, choices)
-    train = [_record(model, run, choices.step, start, stop) for run in training]
-    held = [_record(model, run, choices.step, start, stop) for run in validation]
-    spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in train], axis=0))
-    parameters = Parametrisation.of(model, spread)
+    train = [record_of(model, run, choices.step, start, stop) for run in training]
+    held = [record_of(model, run, choices.step, start, stop) for run in validation]
     began = clock.perf_counter()
 
     def late() -> bool:
         return choices.seconds is not None and clock.perf_counter() - began > choices.seconds
 
-    final = _RolloutError(parameters, held, choices.windows[-1], weights)
-    before = final.relative(np.zeros(parameters.size))
-    best, after = np.zeros(parameters.size), before
+    spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in train], axis=0))
+    parameters = Parametrisation.of(model, spread)
+    final = RolloutError(parameters, held, choices.windows[-1], weights)
+    at = np.zeros(parameters.size)
+    before = after = final.relative(at)
+    if choices.latents and not model.signals.latents:
+        with_latents = start_latents(model, train, choices.latents)
+        parameters = Parametrisation.of(with_latents, spread)
+        final = RolloutError(parameters, held, choices.windows[-1], weights)
+        at = np.zeros(parameters.size)
+    best = at
     history: list[dict[str, float]] = []
-    at = best
     for stage, length in enumerate(choices.windows):
-        problem = _RolloutError(parameters, train, length, weights)
-        check = _RolloutError(parameters, held, length, weights)
+        problem = RolloutError(parameters, train, length, weights)
+        check = RolloutError(parameters, held, length, weights)
         at, found = _stage(problem, check, at, choices.iterations, late)
         history += [{"stage": stage, **entry} for entry in found]
         error = final.relative(at)
         if error < after:
             best, after = at, error
+    refined = parameters.at(jnp.asarray(best))
+    if refined.signals.latents:
+        refined = with_latent_range(refined, [r.latent_path(refined)[r.before :] for r in train])
     names = {"training": [r.name for r in training], "validation": [r.name for r in validation]}
-    return _result(model, parameters, best, (before, after), history, names)
-
-
-# -- records ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Record:
-    """One run on the mesh of the refinement: states and slopes at steps, inputs also between."""
-
-    step: float
-    states: Array
-    slopes: Array
-    inputs: Array
-
-
-def _record(
-    model: DFSM, run: Trajectory, step: float, start: float | None, stop: float | None
-) -> _Record:
-    s = model.signals
-    run = with_computed(run, s.hub_height, s.features)
-    found = differentiate(run, s.specs, s.derivatives)
-    window = run.window(start, stop)
-    count = int((window.time[-1] - window.time[0]) / step * (1 + 1e-9))
-    mesh = window.time[0] + step / 2 * np.arange(2 * count + 1)
-    run.select(s.exogenous).require_finite()
-    dense = run.time_step is not None and run.time_step < step / 2
-    inputs = [
-        np.interp(mesh, run.time, moving_average(run.time, run[n], step) if dense else run[n])
-        for n in s.exogenous
-    ]
-    states = found.trajectory.select(found.names)
-    at = mesh[::2]
-    slopes = [np.interp(at, run.time, d) for d in found.derivatives.T]
-    return _Record(
-        step, states.resample(at).values, np.stack(slopes, axis=1), np.stack(inputs, axis=1)
-    )
+    return _result(model, refined, (before, after), history, names)
 
 
 def _weights(model: DFSM, choices: RefineSettings) -> Array:
-    names = model.signals.names("states")
+    names = [c.name for c in model.signals.observed]
     unknown = [n for n in choices.weights if n not in names]
     if unknown:
         raise DfsmError(
@@ -231,83 +201,12 @@ def _weights(model: DFSM, choices: RefineSettings) -> Array:
     return np.array([choices.weights.get(n, 1.0) for n in names])
 
 
-# -- rollout errors and their slopes ------------------------------------------------------------
-
-
-class _RolloutError:
-    """|r|² of rollouts over windows, with JᵀJ and Jᵀr by forward sensitivities, run by run."""
-
-    def __init__(
-        self,
-        parameters: Parametrisation,
-        records: Sequence[_Record],
-        length: float | None,
-        weights: Array,
-    ) -> None:
-        self._batches = [_windows(r, length) for r in records]
-        overall = np.concatenate([r.states for r in records]).std(axis=0)
-        self._scales = [
-            # A state that hardly moves in one run must not outweigh all others.
-            np.sqrt(weights) / np.maximum(r.states.std(axis=0), 0.1 * overall)
-            for r in records
-        ]
-        self._count = sum(states[:, 1:].size for _, states, _ in self._batches)
-
-        def residual(w: jax.Array, h: float, states: Array, inputs: Array, scale: Array):
-            model = parameters.at(w).prepared()
-            steps = jnp.full(states.shape[1] - 1, h)
-            xs = jax.vmap(lambda x0, v: rk4(model, x0, steps, v, _FAR))(states[:, 0], inputs)
-            return ((xs - states)[:, 1:] * scale).ravel()
-
-        def sums(w: jax.Array, *record: Any) -> tuple[jax.Array, jax.Array]:
-            r, slopes = jax.linearize(lambda w: residual(w, *record), w)
-            J = jax.vmap(slopes)(jnp.eye(w.size))
-            return J @ J.T, J @ r
-
-        self._sums = jax.jit(sums)
-        self._square = jax.jit(lambda w, *record: jnp.sum(residual(w, *record) ** 2))
-
-    def _over_runs(self, function: Callable[..., Any], weights: Array) -> list[Any]:
-        w = jnp.asarray(weights)
-
-        def one(k: int) -> Any:
-            return jax.block_until_ready(function(w, *self._batches[k], self._scales[k]))
-
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            return list(pool.map(one, range(len(self._batches))))
-
-    def cost(self, weights: Array) -> float:
-        """|r|², infinite where a rollout is not finite."""
-        total = float(np.sum([float(v) for v in self._over_runs(self._square, weights)]))
-        return total if np.isfinite(total) else np.inf
-
-    def relative(self, weights: Array) -> float:
-        """Mean square of r: 1 is as wrong as a constant."""
-        return self.cost(weights) / self._count
-
-    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
-        """JᵀJ and Jᵀr."""
-        parts = self._over_runs(self._sums, weights)
-        JtJ, Jtr = (np.sum([np.asarray(p[k]) for p in parts], axis=0) for k in (0, 1))
-        return JtJ, Jtr
-
-
-def _windows(record: _Record, length: float | None) -> tuple[float, Array, Array]:
-    """Step, states ``(window, time, state)`` and inputs ``(window, 2 time - 1, input)``."""
-    steps = len(record.states) - 1
-    each = steps if length is None else min(steps, round(length / record.step))
-    first = np.arange(0, steps - each + 1, each)
-    states = np.stack([record.states[i : i + each + 1] for i in first])
-    inputs = np.stack([record.inputs[2 * i : 2 * (i + each) + 1] for i in first])
-    return record.step, states, inputs
-
-
 # -- stages -------------------------------------------------------------------------------------
 
 
 def _stage(
-    problem: _RolloutError,
-    check: _RolloutError,
+    problem: RolloutError,
+    check: RolloutError,
     start: Array,
     limit: int,
     late: Callable[[], bool],
@@ -331,8 +230,7 @@ def _stage(
 
 def _result(
     model: DFSM,
-    parameters: Parametrisation,
-    best: Array,
+    refined: DFSM,
     errors: tuple[float, float],
     history: Sequence[dict[str, float]],
     names: Mapping[str, list[str]],
@@ -347,7 +245,7 @@ def _result(
         )
         record = dict(model.provenance.record)
         record["refinement"] = {**names, "before": before, "after": after, "message": message}
-        model = replace(parameters.at(jnp.asarray(best)), provenance=Provenance(record))
+        model = replace(refined, provenance=Provenance(record))
     else:
         message = (
             "refinement did not lower the error of rollouts over the runs held out, so the model "

@@ -172,6 +172,7 @@ def select(runs: Iterable[Trajectory], choices: FitSettings) -> Dataset:
     names = dict.fromkeys(roles)
     if choices.azimuth is not None and choices.azimuth.angle is not None:
         names[choices.azimuth.angle] = None
+    names.update(dict.fromkeys(f.source for f in choices.features))
     runs = [with_computed(r, choices.hub_height, choices.features) for r in runs]
     picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
     for run in picked:

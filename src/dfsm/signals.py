@@ -59,6 +59,8 @@ class SignalTable:
     ----------
     states, controls, disturbances, parameters, outputs
         One `Channel` per element of ξ, u, w, p and y.
+    latents
+        The last of the states: those that no channel holds, see `latents.py`.
     specs
         Which states are measured and which are their rates, see `StateSpec`.
     derivatives
@@ -82,11 +84,22 @@ class SignalTable:
     azimuth: Azimuth | None = None
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()
+    latents: tuple[Channel, ...] = ()
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
         """Channels of I = [u, w, ξ, p]."""
         return (*self.controls, *self.disturbances, *self.states, *self.parameters)
+
+    @property
+    def observed(self) -> tuple[Channel, ...]:
+        """The states that a recorded run holds: all but the latent ones."""
+        return self.states[: len(self.states) - len(self.latents)]
+
+    @property
+    def driving(self) -> tuple[str, ...]:
+        """Names of controls and disturbances, the columns of B."""
+        return tuple(c.name for c in (*self.controls, *self.disturbances))
 
     @property
     def exogenous(self) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.integrate import Case, Rollout, adapt, march, mesh_of
+from dfsm.latents import latent_path
 from dfsm.model import DFSM
 from dfsm.settings import settings
 from dfsm.signals import require_constant, with_computed
@@ -169,8 +170,9 @@ def simulate(
     start, stop
         Time window in s; None leaves that end open.
     initial
-        Initial states, shape ``(state,)`` or one row per run; None takes the recorded state at
-        `start`.
+        Initial states, shape ``(state,)`` or one row per run, all of them or all but the latent
+        ones; None takes the recorded state at `start`. Latent states follow from the inputs
+        recorded before `start`.
     options
         Integration method and steps.
 
@@ -202,16 +204,13 @@ def simulate(
     driven = [r.select(names).window(start, stop).require_finite() for r in batch]
     for run in driven:
         require_constant(run, model.signals.names("parameters"))
-    shape = (len(batch), len(model.signals.states))
-    given = None if initial is None else np.asarray(initial, dtype=np.float64)
-    if given is not None:
-        if given.shape not in (shape, shape[1:]):
-            raise DfsmError(f"initial has shape {given.shape}, expected {shape[1:]} or {shape}")
-        given = np.broadcast_to(given, shape)
+    given = None if initial is None else _given(model, initial, len(batch))
 
     def case(i: int) -> Case:
         begins = float(driven[i].time[0])
-        x0 = initial_state(model, batch[i], begins) if given is None else given[i]
+        x0 = _observed_state(model, batch[i], begins) if given is None else given[i]
+        if len(x0) < len(model.signals.states):
+            x0 = np.concatenate([x0, _latent_state(model, batch[i], begins)])
         mesh = mesh_of(driven[i], options.step, options.interpolation)
         return Case(mesh, x0, _initial_azimuth(model, batch[i], begins))
 
@@ -239,7 +238,7 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     model
         The surrogate, for its states and its way of taking derivatives.
     run
-        Holds the measured states.
+        Holds the measured states, and for latent states controls and disturbances.
     start
         Time in s. Where the record begins there, the first second of it gives the rates.
 
@@ -248,6 +247,33 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     ndarray
         Shape ``(state,)``.
     """
+    latent = _latent_state(model, run, start)
+    return np.concatenate([_observed_state(model, run, start), latent])
+
+
+def _given(model: DFSM, initial: ArrayLike, runs: int) -> Array:
+    """Initial states of every run as given, ``(run, state)``, with the latent ones or without."""
+    given, s = np.asarray(initial, dtype=np.float64), model.signals
+    lengths = {len(s.states): None, len(s.observed): None}
+    shapes = [shape for n in lengths for shape in ((n,), (runs, n))]
+    if given.shape not in shapes:
+        raise DfsmError(
+            f"initial has shape {given.shape}, expected {' or '.join(map(str, shapes))}"
+        )
+    return np.broadcast_to(given, (runs, given.shape[-1]))
+
+
+def _latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
+    if not model.signals.latents:
+        return np.empty(0)
+    now = max(2, int(np.searchsorted(run.time, start, side="right")))
+    past = run.select(model.signals.driving)
+    past = replace(past, time=past.time[:now], values=past.values[:now])
+    path = latent_path(model, past)
+    return path[-1] if now > 2 else path[0]
+
+
+def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     s = model.signals
     measured = [n for spec in s.specs for n in (spec.name, spec.rate) if n is not None]
     specs = [replace(spec, acceleration=None) for spec in s.specs]
@@ -283,7 +309,7 @@ def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
 
 def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) -> Simulation:
     s = model.signals
-    n_uw = len(s.controls) + len(s.disturbances)
+    n_uw = len(s.driving)
     columns = slice(n_uw, n_uw + len(s.states))
     low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
     middle, half = (low + high) / 2, (high - low) / 2

@@ -75,21 +75,23 @@ def stabilise(
     """
     if not margin > 0:
         raise DfsmError(f"linear.margin is {margin:g}, expected a positive number of 1/s, or null")
-    rows = [i for i in range(columns.stop - columns.start) if i not in known]
+    n = columns.stop - columns.start
+    rows = [i for i in range(n) if i not in known]
+    held = [*range(columns.start, columns.stop), *fit.constant]
     coefficients = np.array(fit.model.coefficients)
     offsets = np.array(fit.model.offsets)
     variance = np.zeros((len(offsets), offsets.shape[1]))
     moved = []
     for k, equations in enumerate(fit.equations):
         A = state_matrix(coefficients[k], columns, known)
-        fixed = coefficients[k][:, columns]
-        variance[k] = equations.complete(columns, fixed, affine)[2]
+        fixed = coefficients[k][:, held]
+        variance[k] = equations.complete(held, fixed, affine)[2]
         if np.linalg.eigvals(A).real.max() <= -margin:
             continue
         moved.append(float(fit.model.grid[k]))
         metric = equations.partial_covariance(columns, affine)
-        fixed = fixed + _change(A, rows, metric, variance[k], margin)
-        coefficients[k], offsets[k], variance[k] = equations.complete(columns, fixed, affine)
+        fixed[:, :n] += _change(A, rows, metric, variance[k], margin)
+        coefficients[k], offsets[k], variance[k] = equations.complete(held, fixed, affine)
     share = fit.samples / fit.samples.sum()
     model = replace(fit.model, coefficients=jnp.asarray(coefficients), offsets=jnp.asarray(offsets))
     return replace(fit, model=model, residual_rms=np.sqrt(share @ variance)), moved
@@ -123,7 +125,7 @@ def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: f
         weights = np.linalg.lstsq(gram, wanted, rcond=None)[0]
         step = sum(w * c for w, c in zip(weights, cheap, strict=True))
         # Eigenvalues are nonlinear in A: no step may be a large part of the matrix.
-        size, most = np.linalg.norm(step), 0.2 * np.linalg.norm(A[rows])
+        size, most = np.linalg.norm(step), 0.2 * (np.linalg.norm(A[rows]) + margin)
         total = total + (step if size <= most else step * most / size)
     raise DfsmError(
         "no stable linear fit was found near the least-squares one: leave linear.margin out, or "

@@ -22,6 +22,7 @@ from dfsm.comparison import (
 from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.latents import latent_path
 from dfsm.model import DFSM
 from dfsm.progress import track
 from dfsm.signals import Azimuth, radians_per_second, with_computed
@@ -36,6 +37,7 @@ PLATFORM = Band("platform", 0.005, 0.06)
 WAVE = Band("wave", 0.06, 0.25)
 LOW = Band("0-0.3 Hz", 0.0, 0.3)
 _BINS = 60
+_EXOGENOUS = ("controls", "disturbances", "parameters")
 
 
 def validate(
@@ -81,7 +83,7 @@ def validate(
     results = []
     for run in track(runs, "test runs"):
         results.append(_compare(models, run, (start, stop), options))
-    channels = (*first.signals.states, *first.signals.outputs)
+    channels = (*first.signals.observed, *first.signals.outputs)
     return Validation(
         models=dict(models),
         channels=channels,
@@ -122,11 +124,13 @@ def _compare(
     rows = np.isin(found.trajectory.time, inside.time)
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
-    inputs = inside.select([c.name for c in s.inputs]).values
     results = {}
     for name, model in models.items():
         simulation = _simulate_warm(model, run, window, options)
-        predicted = np.asarray(model.derivative(*model.split(inputs)))
+        states = inside.select(c.name for c in s.observed).values
+        states = np.concatenate([states, latent_path(model, run)[rows]], axis=1)
+        u, w, p = (inside.select(s.names(g)).values for g in _EXOGENOUS)
+        predicted = np.asarray(model.derivative(states, u, w, p))[:, : len(s.observed)]
         errors: dict[str, ChannelError] = {}
         statistics: dict[str, ChannelStatistics] = {}
         if simulation.status is Status.COMPLETED:
@@ -162,9 +166,9 @@ def _simulate_warm(
 
 def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
     """States and outputs to compare with: measured ones as recorded, rates as extracted."""
-    names = [c.name for c in (*model.signals.states, *model.signals.outputs)]
+    channels = (*model.signals.observed, *model.signals.outputs)
+    names = [c.name for c in channels]
     values = [run[n] if n in run else differentiated[n] for n in names]
-    channels = (*model.signals.states, *model.signals.outputs)
     return Trajectory(
         run.time,
         np.stack(values, axis=1),
@@ -190,7 +194,8 @@ def _error(simulated: Array, recorded: Array) -> ChannelError:
 def _derivative_errors(model: DFSM, predicted: Array, extracted: Array) -> dict[str, float]:
     rms = np.sqrt(np.mean((predicted - extracted) ** 2, axis=0))
     spread = np.maximum(extracted.std(axis=0), np.finfo(float).tiny)
-    return dict(zip(model.signals.names("states"), (rms / spread).tolist(), strict=True))
+    names = [c.name for c in model.signals.observed]
+    return dict(zip(names, (rms / spread).tolist(), strict=True))
 
 
 def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:

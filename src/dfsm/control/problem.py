@@ -20,6 +20,7 @@ from dfsm.control.signals import GROUPS, Plant, plant_of
 from dfsm.errors import DfsmError, near_matches
 from dfsm.model import DFSM
 from dfsm.settings import require
+from dfsm.signals import with_computed
 from dfsm.simulators import ODESystem
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
@@ -139,14 +140,21 @@ class OptimalControlProblem:
         names = self.plant.names("parameters")
         return tuple(n for n in names if not is_number(self.parameters[n]))
 
-    @property
+    @cached_property
     def scenarios(self) -> tuple[Trajectory | None, ...]:
-        """Disturbances of every scenario; a single None where the model has none."""
+        """Disturbances of every scenario; a single None where there are none."""
         if self.disturbances is None:
             return (None,)
-        if isinstance(self.disturbances, Trajectory):
-            return (self.disturbances,)
-        return tuple(self.disturbances)
+        one = isinstance(self.disturbances, Trajectory)
+        runs = (self.disturbances,) if one else tuple(self.disturbances)
+        return tuple(self._completed(run) for run in runs)
+
+    def _completed(self, run: Trajectory) -> Trajectory:
+        """Add the disturbances that a surrogate computes from others, where the run lacks any."""
+        names = self.plant.names("disturbances")
+        if not isinstance(self.model, DFSM) or all(n in run for n in names):
+            return run
+        return with_computed(run, self.model.signals.hub_height, self.model.signals.features)
 
     @property
     def scenario_weights(self) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,11 @@ SPACING = 1 / 30  # s between knots of the torques: 90 in 3 s
 _SHORT = 0.5  # s
 # One for all n_s, as the spread of MATLAB's newrb: what cross-validation finds for n_s = 500.
 _WIDTH = 0.5
+_CHANGES: dict[str, dict[str, Any]] = {
+    "weights fitted to all samples": {"targets": "all"},
+    "a length for every input": {"directions": "per_input"},
+    "both": {"targets": "all", "directions": "per_input"},
+}
 
 
 @settings
@@ -136,6 +142,8 @@ class MultiFidelity:
         One test run.
     sweep
         Over n_s.
+    changed
+        Multi-fidelity models of the same size in which a part of the recipe is changed.
     chaos
         The arm with gravity; None where it was left out.
     """
@@ -143,6 +151,7 @@ class MultiFidelity:
     found: dict[str, Assessed]
     series: Series
     sweep: Sweep
+    changed: dict[str, Assessed]
     chaos: Chaos | None
 
 
@@ -163,14 +172,17 @@ def choices(system: ODESystem, corrective: CorrectiveChoice) -> FitSettings:
     )
 
 
-def recipe(system: ODESystem, samples: int, width: float | None = _WIDTH) -> FitSettings:
+def recipe(system: ODESystem, samples: int) -> FitSettings:
     """The paper's way."""
-    corrective = RBF(samples=samples, width=width, targets="cluster_means", directions="equal")
     return replace(
-        choices(system, corrective),
+        choices(system, _units(samples)),
         derivatives=DerivativeSettings(method="cubic_spline"),
         nonlinear_only=True,
     )
+
+
+def _units(samples: int) -> RBF:
+    return RBF(samples=samples, width=_WIDTH, targets="cluster_means", directions="equal")
 
 
 def multi_fidelity(
@@ -203,7 +215,11 @@ def multi_fidelity(
     )
     chosen = found[size.samples]
     chaos = _chaos(size.samples, seed) if size.gravity else None
-    return MultiFidelity(chosen, _series(chosen, robot, tests, 0), sweep, chaos)
+    changed = {
+        name: _changed(train, robot, tests, replace(_units(size.samples), **parts))
+        for name, parts in _CHANGES.items()
+    }
+    return MultiFidelity(chosen, _series(chosen, robot, tests, 0), sweep, changed, chaos)
 
 
 def _fit(train: Sequence[Trajectory], settings: FitSettings) -> FitResult:
@@ -224,6 +240,15 @@ def _compared(
         (NONLINEAR, result.nonlinear, seconds["nonlinear-only"]),
     )
     return {name: assess(model, cost, system, tests) for name, model, cost in models}
+
+
+def _changed(
+    train: Sequence[Trajectory], robot: ODESystem, tests: Sequence[Trajectory], units: RBF
+) -> Assessed:
+    settings = recipe(robot, units.samples)
+    result = _fit(train, replace(settings, corrective=units, nonlinear_only=False))
+    cost = result.seconds["linear fit"] + result.seconds["corrective functions"]
+    return assess(result.model, cost, robot, tests)
 
 
 def _series(

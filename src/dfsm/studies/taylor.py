@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.corrective import RBF, NoCorrection
+from dfsm.corrective import RBF
 from dfsm.derivatives import DerivativeSettings, StateSpec
 from dfsm.fit import fit
-from dfsm.linear import LTI
+from dfsm.linear import LTI, fit_linear
 from dfsm.progress import track
-from dfsm.samples import FitSettings
+from dfsm.samples import FitSettings, extract, select
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot_with_gravity
 from dfsm.studies.assess import hushed, slope
@@ -124,11 +124,10 @@ def compare_with_taylor(size: TaylorSize, seed: int) -> TaylorComparison:
 
     fits = []
     for delta in track(size.deltas, "linear fits"):
-        train = runs(delta)[:-1]
-        fits.append(LinearFitAt(delta, _poles(robot, train, True), _poles(robot, train, False)))
+        fits.append(_linear_fit(robot, runs(delta)[:-1], delta))
     *train, test = runs(size.deltas[0])
     with hushed():
-        fitted = fit(train, _settings(robot, RBF(samples=_UNITS), True))
+        fitted = fit(train, _settings(robot))
     thin = slice(None, None, -(-size.points // _SHOWN_POINTS))
     truth, linear = robot.derivative(test), slope(fitted.model.linear_fit(), test)
     example = tuple(a[thin] for a in (test.time, truth, linear, _taylor(robot, test)))
@@ -143,23 +142,28 @@ def compare_with_taylor(size: TaylorSize, seed: int) -> TaylorComparison:
     )
 
 
-def _settings(robot: ODESystem, corrective: RBF | NoCorrection, affine: bool) -> FitSettings:
+def _settings(robot: ODESystem) -> FitSettings:
     return FitSettings(
         states=tuple(StateSpec(name=c.name) for c in robot.states),
         controls=tuple(c.name for c in robot.controls),
         derivatives=DerivativeSettings(method="cubic_spline"),
-        linear=LTI(affine=affine),
-        corrective=corrective,
+        corrective=RBF(samples=_UNITS),
         nonlinear_only=False,
     )
 
 
-def _poles(robot: ODESystem, train: Sequence[Trajectory], affine: bool) -> Array:
-    choices = _settings(robot, NoCorrection(), affine)
-    with hushed():
-        model = fit(train, choices).model
-    ((_, values),) = model.eigenvalues()
-    return values.real
+def _linear_fit(robot: ODESystem, train: Sequence[Trajectory], delta: float) -> LinearFitAt:
+    choices = _settings(robot)
+    samples = extract(select(train, choices), choices)
+    names = [c.name for c in samples.signals.inputs]
+
+    def poles(affine: bool) -> Array:
+        blocks = samples.blocks(samples.inputs, samples.derivatives)
+        found = fit_linear(blocks, names, LTI(affine=affine)).model.coefficients[0]
+        values = np.linalg.eigvals(np.asarray(found)[:, len(robot.controls) :])
+        return np.sort(values.real)[::-1]
+
+    return LinearFitAt(delta, poles(True), poles(False))
 
 
 def _taylor(robot: ODESystem, run: Trajectory) -> Array:

@@ -25,7 +25,7 @@ from dfsm.studies.multi_fidelity import (
 )
 from dfsm.studies.taylor import TaylorComparison, TaylorSize, compare_with_taylor
 
-_LONG_SEED = 1_000_000  # added to the seed of the other runs
+LONG_SEED = 1_000_000  # added to the seed for the runs of 5 s
 
 
 @settings
@@ -105,7 +105,7 @@ def study(size: StudySize | None = None, seed: int = 0) -> RobotStudy:
     linear = compare_with_taylor(size.taylor, seed)
     runs = draw(TRAINING_RUNS + TEST_RUNS, 3.0, seed)
     train, tests = runs[:TRAINING_RUNS], runs[TRAINING_RUNS:]
-    long = draw(TEST_RUNS, 5.0, seed + _LONG_SEED)
+    long = draw(TEST_RUNS, 5.0, seed + LONG_SEED)
     nonlinear = multi_fidelity(train, tests, size.multi_fidelity, seed)
     kinds = fit_kinds(size.kinds, train, tests, long)
     return RobotStudy(

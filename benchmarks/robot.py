@@ -1,0 +1,23 @@
+"""Write the tables of docs/two-link-robot.md, and the README's last one, from a full study.
+
+python -m benchmarks.robot     # takes as long as dfsm demo two-link-robot
+"""
+
+from __future__ import annotations
+
+from benchmarks.readme import ROOT, fill
+from dfsm.report.robot import robot_article
+from dfsm.studies.two_link_robot import study
+
+PAGE = ROOT / "docs" / "two-link-robot.md"
+
+
+def main() -> None:
+    """Run the study and write its tables."""
+    tables = {t.key: t.markdown() for t in robot_article(study()).tables()}
+    for path in (PAGE, ROOT / "README.md"):
+        fill(path, tables)
+
+
+if __name__ == "__main__":
+    main()

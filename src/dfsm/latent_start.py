@@ -1,0 +1,102 @@
+"""Where the learning of latent states starts: poles over a range, drives from what a fit left over.
+
+What a linear fit of the derivatives leaves over is regressed on the inputs filtered by each pole.
+The best single drive per pole is the leading singular pair of those coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.latents import Poles, add_latents, as_states, evolve
+from dfsm.model import DFSM
+from dfsm.parametrise import Parametrisation
+from dfsm.rollout_error import Record
+from dfsm.types import Array
+
+# Poles lie between a thirtieth of the records and some steps of the refinement.
+_SLOWEST, _FASTEST = 30.0, 7.0
+_RIDGE = 1e-2
+
+
+def start_latents(model: DFSM, records: Sequence[Record], count: int) -> DFSM:
+    """Add latent states that explain some of what the model's derivatives leave over.
+
+    Parameters
+    ----------
+    model
+        Has none.
+    records
+        Training runs.
+    count
+        How many, an even number: they come in damped pairs.
+
+    Returns
+    -------
+    DFSM
+        Each pair moves by about one standard deviation.
+    """
+    s, region = model.signals, model.region
+    pairs, n_uw = count // 2, len(s.driving)
+    longest = max((len(r.states) - 1) * r.step for r in records)
+    decay = np.geomspace(_SLOWEST / longest, 1 / (_FASTEST * records[0].step), pairs)
+    spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in records], axis=0))
+    rows = list(Parametrisation.of(model, spread).rows)
+    left = np.concatenate([_left_over(model, r)[:, rows] / spread[rows] for r in records])
+
+    std = np.where(np.asarray(region.std)[:n_uw] > 0, np.asarray(region.std)[:n_uw], 1.0)
+    each = np.repeat(decay, n_uw)
+    drive = np.tile(np.diag(1 / std), (pairs, 1)) * each[:, None]
+    middle = np.asarray(region.mean)[:n_uw]
+    filters = _poles(each, drive, middle)
+    filtered = np.concatenate([_paths(filters, r)[r.before :] for r in records])
+    coefficients = _regress(filtered, left).reshape(len(rows), pairs, n_uw)
+    drives = np.empty((pairs, n_uw), dtype=complex)
+    for k in range(pairs):
+        best = np.linalg.svd(coefficients[:, k], full_matrices=False)[2][0]
+        drives[k] = best * decay[k] / std
+    paths = np.concatenate([_paths(_poles(decay, drives, middle), r) for r in records])
+    drives /= np.sqrt(np.mean(np.abs(paths) ** 2, axis=0) / 2)[:, None]
+    found = _poles(decay, drives, middle)
+    pairs_along = [_paths(found, r)[r.before :] for r in records]
+    c = _regress(np.concatenate(pairs_along), left)
+    coupling = np.zeros((len(s.states), count))
+    # Re(c ζ) in terms of the real states Re ζ and Im ζ.
+    both = np.stack([c.real, -c.imag], axis=2).reshape(len(rows), count)
+    coupling[rows] = both * spread[rows, None]
+    along = [np.asarray(as_states(jnp.asarray(z))) for z in pairs_along]
+    return add_latents(model, found, coupling, along)
+
+
+def _poles(decay: Array, drive: Array, middle: Array) -> Poles:
+    """Poles at 45 degrees, at rest under the mean inputs."""
+    b = jnp.asarray(drive, dtype=complex)
+    return Poles(jnp.asarray(decay), jnp.asarray(decay), b, -b @ middle)
+
+
+def _paths(found: Poles, record: Record) -> Array:
+    h = jnp.full(len(record.inputs) // 2, record.step)
+    v = jnp.asarray(record.inputs[::2, : len(record.rest)])
+    return np.asarray(evolve(found, h, v, jnp.asarray(record.rest)))
+
+
+def _left_over(model: DFSM, record: Record) -> Array:
+    """Recorded minus modelled derivatives at the ends of steps."""
+    s = model.signals
+    v = record.inputs[2 * record.before :: 2]
+    u, w, p = np.split(v, np.cumsum([len(s.controls), len(s.disturbances)]), axis=1)
+    return record.slopes - np.asarray(model.derivative(record.states, u, w, p))
+
+
+def _regress(paths: Array, targets: Array) -> Array:
+    """Complex m with targets = Re(paths mᵀ), ridge regression; shape ``(target, path)``."""
+    X = np.concatenate([paths.real, -paths.imag], axis=1)
+    scale = np.sqrt(np.mean(X**2, axis=0))
+    Z = X / scale
+    Q = Z.T @ Z / len(Z) + _RIDGE * np.eye(Z.shape[1])
+    c = np.linalg.solve(Q, Z.T @ targets / len(Z)) / scale[:, None]
+    n = paths.shape[1]
+    return (c[:n] + 1j * c[n:]).T

@@ -1,0 +1,53 @@
+"""Training samples as a model sees them in a rollout, where its own states stand in for the record.
+
+Outputs of a refined model are fitted on these: a rollout is where they will be used, and latent
+states exist nowhere else.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+from dfsm.errors import DfsmWarning
+from dfsm.latents import latent_path
+from dfsm.model import DFSM
+from dfsm.samples import FitSettings, Samples
+from dfsm.simulate import Status, simulate
+from dfsm.trajectory import Dataset
+
+
+def with_latents(model: DFSM, data: Dataset, samples: Samples, choices: FitSettings) -> Samples:
+    """Add the latent states of a model to the inputs of recorded samples."""
+    if not model.signals.latents:
+        return samples
+    paths = []
+    for run in data:
+        inside = np.isin(run.time, run.window(choices.start, choices.stop).time)
+        paths.append(latent_path(model, run)[inside])
+    at = len(model.signals.driving) + len(model.signals.observed)
+    inputs = np.insert(samples.inputs, [at] * len(model.signals.latents), np.concatenate(paths), 1)
+    return replace(samples, inputs=inputs, signals=model.signals)
+
+
+def along_rollouts(model: DFSM, data: Dataset, samples: Samples, choices: FitSettings) -> Samples:
+    """Samples whose states are those of the model's rollouts of the training runs.
+
+    A run whose rollout ends early keeps its recorded states.
+    """
+    samples = with_latents(model, data, samples, choices)
+    # Its outputs are what is going to be fitted.
+    model = replace(model, signals=replace(model.signals, outputs=()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        found = simulate(model, list(data), start=choices.start, stop=choices.stop)
+    inputs = samples.inputs.copy()
+    first = len(model.signals.driving)
+    names = model.signals.names("states")
+    columns = slice(first, first + len(names))
+    for k, rollout in enumerate(found):
+        if rollout.status is Status.COMPLETED:
+            inputs[samples.runs == k, columns] = rollout.trajectory.select(names).values
+    return replace(samples, inputs=inputs)

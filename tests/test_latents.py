@@ -1,0 +1,251 @@
+"""Latent states on a system that hides one, and their equations against references."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+from dfsm.corrective import GaussianUnits, NoCorrection, Perceptron
+from dfsm.derivatives import StateSpec
+from dfsm.errors import DfsmError
+from dfsm.fit import fit
+from dfsm.latents import Poles, as_states, evolve, latent_path, poles
+from dfsm.linear import LPV, LTI, fit_linear
+from dfsm.parametrise import Parametrisation
+from dfsm.refine import RefineSettings
+from dfsm.rollout_error import RolloutError, record_of
+from dfsm.samples import FitSettings
+from dfsm.simulate import Status, initial_state, simulate
+from dfsm.storage import load, save
+from dfsm.trajectory import Channel, Trajectory
+from dfsm.validate import validate
+from systems import wander
+
+TIME = np.arange(0, 60.01, 0.1)
+START = 20.0
+SETTINGS = FitSettings(
+    states=(StateSpec(name="q"),),
+    controls=("u",),
+    disturbances=("w",),
+    outputs=("y",),
+    start=START,
+    linear=LPV(schedule="w", points=2, margin=0.05),
+    corrective=NoCorrection(),
+    nonlinear_only=False,
+)
+REFINEMENT = RefineSettings(windows=(10.0, None), step=0.2, iterations=8, latents=2)
+
+
+def driven(seed: int) -> Trajectory:
+    """q' = -0.5 q + h + 0.2 w with h' = -0.3 h + 0.3 (u + w) that no channel holds; y = q + 2 h."""
+    rng = np.random.default_rng(seed)
+    u, w = (wander(rng, 0.5, TIME[-1], 2.0)(TIME) for _ in range(2))
+    A = np.array([[-0.5, 1.0], [0.0, -0.3]])
+    B = np.array([[0.0, 0.2], [0.3, 0.3]])
+    q, h = lsim((A, B, np.eye(2), np.zeros((2, 2))), np.stack([u, w], axis=1), TIME)[1].T
+    channels = (Channel("q", "m"), Channel("u", "N"), Channel("w", "m/s"), Channel("y", "m"))
+    values = np.stack([q, u, w, q + 2 * h], axis=1)
+    return Trajectory(TIME, values, channels, name=f"run{seed}")
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[Trajectory]:
+    return [driven(seed) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def plain(runs):
+    return fit(runs, SETTINGS).model
+
+
+@pytest.fixture(scope="module")
+def model(runs):
+    return fit(runs, SETTINGS, REFINEMENT).model
+
+
+def error(model, run: Trajectory, channel: str) -> float:
+    found = simulate(model, run, start=START).trajectory
+    truth = run.window(START)[channel]
+    return float(np.sqrt(np.mean((found[channel] - truth) ** 2)) / truth.std())
+
+
+def test_a_hidden_state_is_found(plain, model):
+    test = driven(99)
+    assert error(plain, test, "q") > 0.2
+    assert error(model, test, "q") < 0.03
+    # Outputs are fitted along rollouts, where the latent states exist.
+    assert error(plain, test, "y") > 0.2
+    assert error(model, test, "y") < 0.05
+
+
+def test_pairs_follow_their_equation(model):
+    found = Poles(
+        jnp.array([0.3, 0.05]),
+        jnp.array([1.2, 0.0]),
+        jnp.array([[1.0 + 2.0j, 0.5], [0.3, -1.0j]]),
+        jnp.array([0.1, 0.2j]),
+    )
+    v = np.stack([np.interp(TIME, driven(7).time, driven(7)[n]) for n in ("u", "w")], axis=1)
+    path = np.asarray(
+        evolve(found, jnp.full(len(TIME) - 1, 0.1), jnp.asarray(v), jnp.asarray(v[0]))
+    )
+    rate = -np.asarray(found.decay) - 1j * np.asarray(found.frequency)
+    force = v @ np.asarray(found.drive).T + np.asarray(found.offset)
+    start = -force[0] / rate
+    for k in range(2):
+        sys = np.array([[rate[k].real, -rate[k].imag], [rate[k].imag, rate[k].real]])
+        both = np.stack([force[:, k].real, force[:, k].imag], axis=1)
+        x0 = [start[k].real, start[k].imag]
+        exact = lsim((sys, np.eye(2), np.eye(2), np.zeros((2, 2))), both, TIME, X0=x0)[1]
+        np.testing.assert_allclose(path[:, k], exact[:, 0] + 1j * exact[:, 1], atol=5e-4)
+    assert as_states(jnp.asarray(path)).shape == (len(TIME), 4)
+
+
+def test_rollouts_carry_them_along(model):
+    run = driven(3)
+    states = simulate(model, run, start=START).trajectory
+    names = [c.name for c in model.signals.latents]
+    path = latent_path(model, run)[run.time >= START]
+    spread = np.maximum(path.std(axis=0), 1e-9)
+    assert (np.abs(states.select(names).values - path) < 1e-3 * spread).all()
+    np.testing.assert_array_equal(initial_state(model, run, START)[1:], path[0])
+
+
+def test_nothing_measured_after_the_start_enters(model):
+    run = driven(3)
+    values = run.values.copy()
+    values[run.time > START, 0] += 5.0
+    one, other = (simulate(model, r, start=START) for r in (run, replace(run, values=values)))
+    np.testing.assert_array_equal(one.trajectory.values, other.trajectory.values)
+
+
+def test_initial_states_may_be_given_without_them(model):
+    run = driven(3)
+    whole = simulate(model, run, start=START, initial=initial_state(model, run, START))
+    some = simulate(model, run, start=START, initial=[run.window(START)["q"][0]])
+    np.testing.assert_array_equal(whole.trajectory.values, some.trajectory.values)
+    with pytest.raises(DfsmError, match=r"initial has shape \(2,\), expected \(3,\)"):
+        simulate(model, run, start=START, initial=[0.0, 0.0])
+
+
+def test_a_record_that_begins_at_the_start_begins_at_rest(model):
+    run = driven(3).window(START)
+    assert simulate(model, run).status is Status.COMPLETED
+    x0 = initial_state(model, run, START)
+    mean = run.select(model.signals.driving).values[run.time <= START + 20.0].mean(axis=0)
+    full = model.derivative(x0, mean[:1], mean[1:])
+    # Only the first sample was there to tell what came before.
+    assert np.isfinite(np.asarray(full)).all()
+
+
+def test_their_rows_are_stable_and_know_no_schedule(model):
+    L = np.asarray(model.f.coefficients)
+    np.testing.assert_array_equal(L[0, 1:], L[1, 1:])
+    assert (np.asarray(poles(model).decay) > 0).all()
+    n_uw = len(model.signals.driving)
+    assert (L[:, 1:, n_uw] == 0).all()
+    for _, values in model.eigenvalues():
+        assert len(values) == 3
+        assert values.real.max() < 0
+
+
+def test_everything_else_takes_them(model, tmp_path, runs):
+    assert "latent1" in model.summary()
+    save(model, tmp_path / "m")
+    again = load(tmp_path / "m")
+    np.testing.assert_array_equal(
+        simulate(model, runs[0]).trajectory.values, simulate(again, runs[0]).trajectory.values
+    )
+    A, B, C, _ = model.jacobians(np.zeros(3), [0.0], [0.0])
+    assert A.shape == (3, 3)
+    assert B.shape == (3, 2)
+    assert C.shape == (1, 3)
+    checked = validate(model, [driven(98)], start=START)
+    assert [c.name for c in checked.channels] == ["q", "y"]
+    assert checked.runs[0].models["multi-fidelity"].derivative_errors["q"] < 0.05
+    assert len(model.region.low) == len(model.signals.inputs)
+    assert simulate(model, driven(97), start=START).outside < 0.2
+
+
+@pytest.mark.parametrize("kind", ["units", "perceptron", "none"])
+def test_slopes_written_out_are_those_of_the_model(model, kind):
+    rng = np.random.default_rng(0)
+    inputs, units = len(model.signals.inputs), 4
+    arrays = [rng.normal(size=s) for s in ((inputs, units), (1, units), (units, inputs))]
+    centres, out, first = map(jnp.asarray, arrays)
+    shift, scale = jnp.zeros(inputs), jnp.full(inputs, 2.0)
+    e = {
+        "units": GaussianUnits(shift, scale, centres, out, jnp.zeros(1)),
+        "perceptron": Perceptron(shift, scale, (first, out), (jnp.zeros(units), jnp.zeros(1))),
+        "none": None,
+    }[kind]
+    full = replace(model, e=e, corrected=() if e is None else (0,))
+    parameters = Parametrisation.of(full, np.array([0.7]))
+    at = jnp.asarray(0.1 * rng.normal(size=parameters.size))
+    for _ in range(3):
+        point = jnp.asarray(rng.normal(size=inputs))
+        x, u, w, p = full.split(point)
+        slopes = jax.jacfwd(lambda t, x=x, u=u, w=w, p=p: parameters.at(t).derivative(x, u, w, p))
+        found = parameters.slopes(at, parameters.at(at), point)
+        np.testing.assert_allclose(found, slopes(at), rtol=1e-9, atol=1e-12)
+
+
+def test_sensitivities_agree_with_differences(model, runs):
+    record = record_of(model, runs[0], 0.2, START, 40.0)
+    parameters = Parametrisation.of(model, np.array([0.7]))
+    problem = RolloutError(parameters, [record], 5.0, np.ones(1))
+    at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
+    _, Jtr = problem.normal_equations(at)
+    eps, slopes = 1e-6, []
+    for d in eps * np.eye(parameters.size):
+        slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
+    np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-7)
+
+
+def test_an_odd_number_is_refused():
+    with pytest.raises(DfsmError, match=r"refine\.latents is 3, expected an even number"):
+        replace(REFINEMENT, latents=3)
+
+
+def test_constant_coefficients(runs):
+    choices = replace(SETTINGS, linear=LPV(schedule="w", points=3, constant=("u",), margin=0.05))
+    L = np.asarray(fit(runs, choices).model.f.coefficients)
+    assert (L[:, 0, 0] == L[0, 0, 0]).all()
+    assert np.ptp(L[:, 0, 1]) > 0
+    refined = fit(runs, choices, replace(REFINEMENT, windows=(5.0,), iterations=2)).model
+    L = np.asarray(refined.f.coefficients)
+    assert np.ptp(L[:, 0, 0]) == 0
+    assert np.ptp(L[:, 0, 1]) > 0
+    with pytest.raises(DfsmError, match=r"linear\.constant names 'torque', which is not an input"):
+        fit(runs, replace(choices, linear=LPV(schedule="w", constant=("torque",))))
+
+
+def test_shared_coefficients_are_those_of_one_regression(runs):
+    """Against one least-squares problem with an offset and slopes of its own per window."""
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(4000, 3))
+    schedule = inputs[:, 2]
+    targets = (2.0 * inputs[:, 0] + schedule * inputs[:, 1] + 0.01 * rng.normal(size=4000))[:, None]
+    edges = np.array([[-9.0, 0.0], [0.0, 9.0]])
+    names = ["a", "b", "s"]
+    found = fit_linear(
+        [(inputs, targets)], names, LPV(schedule="s", points=2, constant=("a",)), edges
+    )
+    left = (schedule < 0)[:, None]
+    own = np.column_stack([np.ones(4000), inputs[:, 1:]])
+    X = np.column_stack([inputs[:, 0], own * left, own * ~left])
+    reference = np.linalg.lstsq(X, targets[:, 0], rcond=None)[0]
+    L = np.asarray(found.model.coefficients)[:, 0]
+    assert L[:, 0] == pytest.approx(reference[0], rel=1e-6)
+    np.testing.assert_allclose(L[:, 1], reference[[2, 5]], rtol=1e-2)
+
+
+def test_lti_models_take_latents_too(runs):
+    choices = replace(SETTINGS, linear=LTI(margin=0.05))
+    found = fit(runs, choices, REFINEMENT).model
+    assert error(found, driven(99), "q") < 0.03
