@@ -145,9 +145,9 @@ class OptimalControlProblem:
         """Disturbances of every scenario; a single None where there are none."""
         if self.disturbances is None:
             return (None,)
-        one = isinstance(self.disturbances, Trajectory)
-        runs = (self.disturbances,) if one else tuple(self.disturbances)
-        return tuple(self._completed(run) for run in runs)
+        if isinstance(self.disturbances, Trajectory):
+            return (self._completed(self.disturbances),)
+        return tuple(self._completed(run) for run in self.disturbances)
 
     def _completed(self, run: Trajectory) -> Trajectory:
         """Add the disturbances that a surrogate computes from others, where the run lacks any."""
