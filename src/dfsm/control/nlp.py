@@ -17,7 +17,7 @@ import numpy as np
 
 from dfsm.control.program import Program
 from dfsm.errors import DfsmError
-from dfsm.types import Array, IntArray
+from dfsm.types import Array
 
 # Names that IPOPT gives its outcomes, in groups that ask for the same action.
 _SOLVED = ("Solve_Succeeded", "Feasible_Point_Found")
@@ -103,25 +103,16 @@ def solve_nlp(
     Outcome
         Also for problems that were not solved.
     """
-    import casadi
+    from dfsm.control.callbacks import make_solver
 
-    watch = _Watch(program)
+    watch = Watch(program)
     with _interruptible(watch), _quiet():
-        functions = _functions(casadi, program, watch)
-        # `functions` keeps the wrapped functions alive, which CasADi does not.
-        chosen = {k: v for k, v in functions.items() if k != "nlp"}
-        chosen |= _ipopt(program, options, multipliers is not None)
-        solver = casadi.nlpsol("dfsm", "ipopt", functions["nlp"], chosen)
+        solver = make_solver(program, watch, _ipopt(program, options, multipliers is not None))
         begin = clock.perf_counter()
-        given: dict[str, Any] = {"lam_g0": multipliers} if multipliers is not None else {}
-        found = solver(
-            x0=start,
-            lbx=program.lower,
-            ubx=program.upper,
-            lbg=program.g_lower,
-            ubg=program.g_upper,
-            **given,
-        )
+        limits = {"lbx": program.lower, "ubx": program.upper}
+        limits |= {"lbg": program.g_lower, "ubg": program.g_upper}
+        given = {} if multipliers is None else {"lam_g0": multipliers}
+        found = solver(x0=start, **limits, **given)
     if watch.error is not None:
         raise watch.error
     stats = solver.stats()
@@ -194,79 +185,7 @@ def _ipopt(program: Program, options: NlpOptions, multipliers: bool) -> dict[str
     return chosen
 
 
-def _functions(casadi: Any, program: Program, watch: _Watch) -> dict[str, Any]:
-    """Wrap the program's functions under the names that CasADi expects."""
-
-    class Wrapped(casadi.Callback):
-        def __init__(self, name: str, ins: list, outs: list, function: Callable[..., Any]) -> None:
-            casadi.Callback.__init__(self)
-            self.ins, self.outs, self.function = ins, outs, function
-            self.construct(name, {})
-
-        def get_n_in(self) -> int:
-            return len(self.ins)
-
-        def get_n_out(self) -> int:
-            return len(self.outs)
-
-        def get_name_in(self, i: int) -> str:
-            return self.ins[i][0]
-
-        def get_name_out(self, i: int) -> str:
-            return self.outs[i][0]
-
-        def get_sparsity_in(self, i: int) -> Any:
-            return self.ins[i][1]
-
-        def get_sparsity_out(self, i: int) -> Any:
-            return self.outs[i][1]
-
-        def has_eval_buffer(self) -> bool:
-            return True
-
-        def eval_buffer(self, arg: Any, res: Any) -> int:
-            return watch.call(self.function, arg, res)
-
-    n, m, p = program.n, program.m, program
-    dense = casadi.Sparsity.dense
-    x, nothing = ("x", dense(n, 1)), ("p", casadi.Sparsity(0, 1))
-    f, g, one = ("f", dense(1, 1)), ("g", dense(m, 1)), dense(1, 1)
-
-    def sparsity(height: int, pattern: tuple[IntArray, IntArray]) -> Any:
-        rows, starts = pattern
-        return casadi.Sparsity(height, n, starts.tolist(), rows.tolist())
-
-    jac = ("jac_g_x", sparsity(m, p.jacobian_pattern))
-    triu = ("triu_hess_gamma_x_x", sparsity(n, p.hessian_pattern))
-    lam_f, lam_g = ("lam_f", one), ("lam_g", dense(m, 1))
-    names = [casadi.nlpsol_out(i) for i in range(casadi.nlpsol_n_out())]
-    shapes = {"f": one, "x": dense(n, 1), "lam_x": dense(n, 1)}
-    shapes |= {"g": dense(m, 1), "lam_g": dense(m, 1)}
-    step = [(name, shapes.get(name, casadi.Sparsity(0, 0))) for name in names]
-    return {
-        "nlp": Wrapped(
-            "nlp", [x, nothing], [f, g], lambda z, _p: (p.objective(z), p.constraints(z))
-        ),
-        "grad_f": Wrapped(
-            "nlp_grad_f",
-            [x, nothing],
-            [f, ("grad_f_x", dense(n, 1))],
-            lambda z, _p: (p.objective(z), p.gradient(z)),
-        ),
-        "jac_g": Wrapped(
-            "nlp_jac_g", [x, nothing], [g, jac], lambda z, _p: (p.constraints(z), p.jacobian(z))
-        ),
-        "hess_lag": Wrapped(
-            "nlp_hess_l",
-            [x, nothing, lam_f, lam_g],
-            [triu],
-            lambda z, _p, s, lam: (p.hessian(z, s[0], lam),),
-        ),
-        "iteration_callback": Wrapped("step", step, [("stop", one)], watch.step(names)),
-    }
-
-
-class _Watch:
+class Watch:
     """What happens during a solve: Ctrl-C, errors in callbacks, and the best iterate."""
 
     def __init__(self, program: Program) -> None:
@@ -277,6 +196,7 @@ class _Watch:
         self._merit = (np.inf, np.inf)
 
     def call(self, function: Callable[..., Any], arg: Any, res: Any) -> int:
+        """Evaluate a function on the solver's buffers; 1 if it raised an error."""
         values = [np.empty(0) if a is None else np.frombuffer(a) for a in arg]
         try:
             with np.errstate(all="ignore"):  # the solver steps back from values that are not finite
@@ -290,6 +210,7 @@ class _Watch:
         return 0
 
     def step(self, names: list[str]) -> Callable[..., Any]:
+        """Function that sees every iterate, given by name, and says whether to stop."""
         x, g, f, lam_g, lam_x = (names.index(k) for k in ("x", "g", "f", "lam_g", "lam_x"))
 
         def seen(*values: Array) -> tuple[float]:
@@ -310,7 +231,7 @@ def violation(g: Array, low: Array, high: Array) -> Array:
 
 
 @contextmanager
-def _interruptible(watch: _Watch) -> Iterator[None]:
+def _interruptible(watch: Watch) -> Iterator[None]:
     """Let Ctrl-C end the solve at its next iteration; a second one acts as usual."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread receives signals

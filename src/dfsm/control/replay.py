@@ -47,24 +47,17 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
     duration = start.stop - problem.start
     size = np.abs(X).max(axis=0)
     size = np.where(size > 0, size, 1.0)
-    count = -(-grid.intervals // _PAD) * _PAD
-
-    def pad(a: Array) -> Array:
-        extra = np.zeros((count - len(a), *a.shape[1:]))
-        return np.concatenate([a, extra])
-
-    # Monomials in θ of the controls; an interval of no length changes nothing.
-    points = np.linspace(0, 1, len(grid.scheme.points))
-    basis = np.linalg.inv(np.vander(points, increasing=True)) @ grid.scheme.control_basis(points)
-    pieces = {
-        "begin": pad(grid.edges[:-1]),
-        "length": pad(grid.lengths),
-        "controls": pad(np.einsum("mn,knc->kmc", basis, U[grid.local])),
-    }
     shared = [*start.p, *([start.stop] if problem.free_time is not None else [])]
     common = common_of(problem) | _table(problem, scenario)
     found = _integrate(
-        functions, pieces, X[0], size, np.asarray(shared), common, duration, grid.scheme.points
+        functions,
+        _pieces(grid, U),
+        X[0],
+        size,
+        np.asarray(shared),
+        common,
+        duration,
+        grid.scheme.points,
     )
     states = np.concatenate([X[:1], np.asarray(found)[: grid.intervals].reshape(-1, X.shape[1])])
     gap = np.abs(states - X).max(axis=0)
@@ -77,6 +70,23 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
         dict(zip(names, map(float, gap), strict=True)),
         float((gap / size).max()),
     )
+
+
+def _pieces(grid: Grid, U: Array) -> dict[str, Array]:
+    """Begin, length and controls, as monomials in θ, of every interval."""
+    count = -(-grid.intervals // _PAD) * _PAD
+    points = np.linspace(0, 1, len(grid.scheme.points))
+    basis = np.linalg.inv(np.vander(points, increasing=True)) @ grid.scheme.control_basis(points)
+
+    def pad(a: Array) -> Array:
+        # An interval of no length changes nothing.
+        return np.concatenate([a, np.zeros((count - len(a), *a.shape[1:]))])
+
+    return {
+        "begin": pad(grid.edges[:-1]),
+        "length": pad(grid.lengths),
+        "controls": pad(np.einsum("mn,knc->kmc", basis, U[grid.local])),
+    }
 
 
 def _table(problem: OptimalControlProblem, scenario: int) -> dict[str, Any]:

@@ -36,6 +36,8 @@ _ENDINGS = {
     "failed": Ending.FAILED,
 }
 
+# Outcomes of the solver that can be built on.
+_GOOD = ("solved", "acceptable")
 # Objectives that are smaller than 1 by this factor are scaled up, by no more than the second.
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Scaled violations up to which a start counts as close to a solution.
@@ -77,10 +79,17 @@ def solve(
         by JAX; bounds or settings that contradict each other.
     """
     method = method or DirectTranscription()
+    record = _solve_meshes(problem, method, guess)
+    return _solution(problem, record, simulate)
+
+
+def _solve_meshes(
+    problem: OptimalControlProblem, method: Method, guess: Solution | Trajectory | None
+) -> _Record:
+    """Solve on one mesh after the other, each from the solution on the last."""
     grid = method.grid()
     start = start_of(problem, guess, grid.tau)
-    warm = isinstance(guess, Solution)
-    multipliers = None
+    near, multipliers = isinstance(guess, Solution), None
     if isinstance(guess, Solution) and np.array_equal(guess.grid.edges, grid.edges):
         multipliers = guess.solver_state
     record = _Record()
@@ -93,21 +102,19 @@ def solve(
             shot = Transcription(problem, grid, start, method.stay_inside)
         else:
             shot = Shooting(problem, method, start)
-        z = shot.scaled(start)
         shot.program.objective_scale = record.objective_scale
+        z = shot.scaled(start)
         _prepare(shot, z)
+        warm = near and _is_near(shot, start)
         record.compile += clock.perf_counter() - begin
-        warm = (warm or round_ > 0) and _is_near(shot, start)
-        if not warm:
-            multipliers = None
         options = NlpOptions(method.tolerance, method.most_iterations, warm)
-        outcome = _solve_scaled(shot.program, z, options, multipliers)
+        outcome = _solve_scaled(shot.program, z, options, multipliers if warm else None)
         start = shot.unscaled(outcome.z)
         errors = shot.errors(start)
-        record.add(shot, outcome, float(errors.max()))
+        record.add(shot, outcome, start, float(errors.max()))
         if refine is None or errors.max() <= refine or grid.intervals > _MOST_INTERVALS:
             break
-        if round_ == rounds or outcome.ending not in ("solved", "acceptable"):
+        if round_ == rounds or outcome.ending not in _GOOD:
             break
         old, grid = grid, grid.refined(errors, refine)
         start = replace(
@@ -115,9 +122,9 @@ def solve(
             X=np.stack([old.states(X, grid.tau) for X in start.X]),
             U=np.stack([old.controls(U, grid.tau) for U in start.U]),
         )
-        multipliers = None
+        near, multipliers = True, None
     record.coarse = refine is not None and not record.error <= refine
-    return _solution(problem, record, start, simulate)
+    return record
 
 
 def _is_near(shot: Shot, start: Start) -> bool:
@@ -143,15 +150,18 @@ def _solve_scaled(
     """Solve, and again if the objective turns out to be so small that tolerances hide it."""
     scale = program.objective_scale
     first = _solve_once(program, z, options, multipliers)
+    if options.warm and first.ending not in (*_GOOD, "interrupted"):
+        # What looked close was not: start afresh from the same point.
+        first = _solve_once(program, z, replace(options, warm=False), None)
     value = abs(program.cost(first.z))
     wanted = min(1 / max(value, 1e-300), _MOST_SCALE)
-    if first.ending not in ("solved", "acceptable") or value == 0 or wanted < _CLEARLY * scale:
+    if first.ending not in _GOOD or value == 0 or wanted < _CLEARLY * scale:
         return first
     program.objective_scale = wanted
     second = _solve_once(program, first.z, replace(options, warm=True), first.multipliers)
     if second.ending != "solved":
         program.objective_scale = scale
-        return first
+        return replace(first, ending="interrupted") if second.ending == "interrupted" else first
     return replace(
         second,
         iterations=first.iterations + second.iterations,
@@ -184,8 +194,9 @@ class _Record:
         self.coarse = False
         self.objective_scale = 1.0
 
-    def add(self, shot: Shot, outcome: Outcome, error: float) -> None:
+    def add(self, shot: Shot, outcome: Outcome, start: Start, error: float) -> None:
         """Keep one mesh."""
+        self.start = start
         self.shot, self.outcome, self.error = shot, outcome, error
         self.objective_scale = shot.program.objective_scale
         self.solve += outcome.seconds
@@ -200,10 +211,8 @@ class _Record:
         )
 
 
-def _solution(
-    problem: OptimalControlProblem, record: _Record, start: Start, simulate: bool
-) -> Solution:
-    shot, outcome = record.shot, record.outcome
+def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -> Solution:
+    shot, outcome, start = record.shot, record.outcome, record.start
     program, z = shot.program, outcome.z
     ending = _ENDINGS[outcome.ending]
     if ending is Ending.SOLVED and record.coarse:
