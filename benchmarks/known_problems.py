@@ -28,15 +28,12 @@ class Known:
         What to solve.
     value
         The optimal objective.
-    bang_bang
-        Whether the optimal controls jump, which limits the accuracy on any mesh.
     guess
         Straight lines between two samples, where the ends do not give them.
     """
 
     problem: OptimalControlProblem
     value: float
-    bang_bang: bool = False
     guess: Trajectory | None = None
 
 
@@ -240,7 +237,7 @@ def robot_time() -> Known:
         final_cost=lambda _start, end: end.t,
         name="TwoLinkRobot, time",
     )
-    return Known(problem, 2.98228, bang_bang=True)
+    return Known(problem, 2.98228)
 
 
 def container_crane() -> Known:

@@ -39,7 +39,7 @@ def test_known_answers(name, scheme):
     assert found.solved, found.message
     assert found.error <= method.refine
     assert found.violation <= 1e-7
-    assert relative_error(found.objective, name) < (1e-5 if known(name).bang_bang else 1e-6)
+    assert relative_error(found.objective, name) < 1e-6
     assert found.objective == pytest.approx(found.final_cost + found.integral_cost)
 
 
