@@ -454,6 +454,26 @@ BAD = {
         {"constraints": {"c": lambda s: s.x.place}},
         r"constraints 'c' is .*, expected \(function, low, high\)",
     ),
+    "bounds without a pair": (
+        {"bounds": {"force": 3.0}},
+        r"bounds of 'force' are 3\.0, expected a pair \(low, high\)",
+    ),
+    "initial text": (
+        {"initial": {"place": "zero"}},
+        r"initial of 'place' are 'zero', expected a number or a pair",
+    ),
+    "horizon of lists": (
+        {"horizon": (0.0, [1.0, 9.0])},
+        r"the horizon is \(0\.0, \[1\.0, 9\.0\]\)",
+    ),
+    "limit of another length": (
+        {"bounds": {"force": (None, lambda t: np.ones(3))}},
+        r"a limit of 'force' has shape \(3,\) at 201 times",
+    ),
+    "overdetermined": (
+        {"constraints": {"c": (lambda s: s.x.place, 1.0, 1.0)}},
+        r"121 equality constraints for 119 variables leave nothing to choose",
+    ),
     "no model": ({"model": "cart"}, r"model is a str, expected a DFSM or an ODESystem"),
 }
 

@@ -102,9 +102,15 @@ def solve_nlp(
     -------
     Outcome
         Also for problems that were not solved.
+
+    Raises
+    ------
+    DfsmError
+        There are more equality constraints than variables.
     """
     from dfsm.control.callbacks import make_solver
 
+    _require_freedom(program)
     watch = Watch(program)
     with _interruptible(watch), _quiet():
         solver = make_solver(program, watch, _ipopt(program, options, multipliers is not None))
@@ -129,6 +135,17 @@ def solve_nlp(
         int(stats["iter_count"]),
         clock.perf_counter() - begin,
     )
+
+
+def _require_freedom(program: Program) -> None:
+    fixed = int((program.lower == program.upper).sum())
+    equalities = int((program.g_lower == program.g_upper).sum())
+    if equalities > program.n - fixed:
+        raise DfsmError(
+            f"{equalities} equality constraints for {program.n - fixed} variables leave nothing to "
+            "choose: turn a path or boundary equality into limits, free an end, or use more "
+            "intervals"
+        )
 
 
 def _ending(word: str) -> str:

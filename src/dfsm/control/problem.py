@@ -96,6 +96,7 @@ class OptimalControlProblem:
 
     def __post_init__(self) -> None:
         _check_names(self)
+        _check_pairs(self)
         _check_horizon(self)
         _check_disturbances(self)
         _check_limits(self)
@@ -200,13 +201,23 @@ def level(given: Level, name: str, time: Array, default: float) -> Array:
     -------
     ndarray
         Shape ``(time,)``.
+
+    Raises
+    ------
+    DfsmError
+        The limit gives another number of values.
     """
     if given is None:
         return np.full(len(time), default)
     if isinstance(given, Trajectory):
         return given.select([name]).resample(time).values[:, 0]
-    value = given(time) if callable(given) else given
-    return np.broadcast_to(np.asarray(value, dtype=np.float64), np.shape(time)).copy()
+    value = np.asarray(given(time) if callable(given) else given, dtype=np.float64)
+    if value.shape not in ((), np.shape(time)):
+        raise DfsmError(
+            f"a limit of '{name}' has shape {value.shape} at {len(time)} times: a function of time "
+            "takes an array and returns one number or one per time"
+        )
+    return np.broadcast_to(value, np.shape(time)).copy()
 
 
 # -- checks -------------------------------------------------------------------------------------
@@ -243,6 +254,41 @@ def _check_names(problem: OptimalControlProblem) -> None:
                 raise DfsmError(
                     f"{name}: {place} '{key}' is {given!r}, expected (function, low, high)"
                 )
+
+
+def _check_pairs(problem: OptimalControlProblem) -> None:
+    """Refuse what is not of the form that its field asks for."""
+    for place, number, limits in (
+        ("bounds", False, _is_level),
+        ("rates", False, _is_level),
+        ("initial", True, _is_limit),
+        ("final", True, _is_limit),
+        ("parameters", True, is_number),
+    ):
+        for key, given in getattr(problem, place).items():
+            pair = isinstance(given, tuple) and len(given) == 2 and all(map(limits, given))
+            if not (pair or (number and is_number(given))):
+                raise DfsmError(
+                    f"{problem.name}: {place} of '{key}' are {given!r}, expected "
+                    + ("a number or " if number else "")
+                    + "a pair (low, high)"
+                )
+    horizon = problem.horizon
+    last = horizon[1] if isinstance(horizon, tuple) and len(horizon) == 2 else None
+    free = isinstance(last, tuple) and len(last) == 2 and all(map(is_number, last))
+    if not (is_number(last) or free) or not is_number(horizon[0]):
+        raise DfsmError(
+            f"{problem.name}: the horizon is {horizon!r}, expected (first, last) or (first, "
+            "(earliest last, latest last)) in s"
+        )
+
+
+def _is_limit(given: object) -> bool:
+    return given is None or is_number(given)
+
+
+def _is_level(given: object) -> bool:
+    return _is_limit(given) or callable(given) or isinstance(given, Trajectory)
 
 
 def _check_horizon(problem: OptimalControlProblem) -> None:
