@@ -51,9 +51,9 @@ def model():
 
 @pytest.mark.parametrize("level", [0.7, 0.9])
 def test_new_runs_lie_inside_as_often_as_promised(model, level):
-    found = calibrate(model, [run(seed) for seed in range(100, 120)], level=level)
+    found = calibrate(model, [run(seed) for seed in range(100, 160)], level=level)
     assert found.channels == ("q", "y")
-    new = [run(seed) for seed in range(200, 240)]
+    new = [run(seed) for seed in range(200, 260)]
     shares = [found.coverage(simulate(model, r), r, r) for r in new]
     np.testing.assert_allclose(np.mean(shares, axis=0), level, atol=0.05)
     # y = 2 q, and the hidden force is stronger where the wind is.

@@ -14,6 +14,16 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dfsm.config import load_config
+    from dfsm.control import (
+        DirectTranscription,
+        MultipleShooting,
+        OptimalControlProblem,
+        SingleShooting,
+        Solution,
+        load_solution,
+        save_solution,
+        solve,
+    )
     from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
     from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.errors import DfsmError, DfsmWarning
@@ -106,6 +116,14 @@ _HOME = {
     "validate": "validate",
     "calibrate": "intervals",
     "Intervals": "intervals",
+    "OptimalControlProblem": "control",
+    "DirectTranscription": "control",
+    "MultipleShooting": "control",
+    "SingleShooting": "control",
+    "solve": "control",
+    "Solution": "control",
+    "save_solution": "control",
+    "load_solution": "control",
     "write_report": "report",
     "load_config": "config",
 }
