@@ -30,6 +30,7 @@ STATES = ("PtfmPitch", "PtfmPitch_dot", "GenSpeed")
 LOADS = ("TwrBsFxt", "TwrBsMyt")
 # Errors are stated below this frequency, as the field does, and unfiltered beside it.
 CUTOFF = 0.5  # Hz
+LONGER = 30  # refinement steps per stage
 SWEEP = np.arange(4.0, 22.5, 1.0)  # m/s
 SWEEP_SECONDS = 1500.0
 
@@ -90,6 +91,7 @@ def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
     average = replace(plain, disturbances=("RotWind", "Wave1Elev"), features=())
     refinement = turbine.REFINEMENT
     bare = replace(refinement, latents=0)
+    longer = replace(refinement, latents=10, iterations=LONGER)
     for name, runs, choices, refine in (
         ("linear fit, all winds", closed, replace(average, linear=dfsm.LTI()), None),
         ("LPV in the wind, stable", closed, average, None),
@@ -98,6 +100,7 @@ def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
         ("and refinement on rollouts", both, plain, bare),
         ("and latent states, without perturbed runs", closed, plain, refinement),
         ("and latent states: the demo's model", both, full, refinement),
+        ("the same, ten latent states, refined for longer", both, full, longer),
     ):
         begin = time.perf_counter()
         yield name, [dfsm.fit(runs, choices, refine).model], time.perf_counter() - begin

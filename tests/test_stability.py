@@ -13,7 +13,7 @@ from dfsm.correction import destabilised
 from dfsm.corrective import GaussianUnits
 from dfsm.errors import DfsmError
 from dfsm.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
-from dfsm.stability import stabilise, state_matrix
+from dfsm.stability import fastest_growth, stabilise, state_matrix
 from dfsm.types import Array
 from systems import OSCILLATOR_A, linear_model
 
@@ -137,3 +137,25 @@ def test_a_correction_that_destabilises_an_operating_point_is_named():
     growth = np.linalg.eigvals(OSCILLATOR_A + np.diag([0.0, 4 * np.exp(-1)])).real.max()
     assert growth > 0
     assert said == f"with a correction the model would be unstable (growth {growth:.2g} 1/s)"
+
+
+def test_mixtures_of_schedule_points_are_stable_too() -> None:
+    """Half of [[-1, 4], [0, -1]] and half of its transpose has the eigenvalue 1."""
+    rng = np.random.default_rng(0)
+    upper = np.array([[-1.0, 4.0], [0.0, -1.0]])
+    parts = []
+    for wind, A in ((0.0, upper), (1.0, upper.T)):
+        x = rng.normal(size=(3000, 2))
+        inputs = np.concatenate([wind + 0.05 * rng.normal(size=(3000, 1)), x], axis=1)
+        parts.append((inputs, x @ A.T + 0.1 * rng.normal(size=(3000, 2))))
+    windows = np.array([[-0.5, 0.5], [0.5, 1.5]])
+    plain = fit_linear(parts, ["w", "a", "b"], LPV(schedule="w", points=2), windows)
+    columns = slice(1, 3)
+    at_points = [
+        np.linalg.eigvals(L[:, 1:]).real.max() for L in np.asarray(plain.model.coefficients)
+    ]
+    assert max(at_points) < -0.7
+    assert fastest_growth(plain.model, columns) == pytest.approx(1.0, abs=0.05)
+    stable, moved = stabilise(plain, columns, {}, 0.1, affine=True)
+    assert fastest_growth(stable.model, columns) <= -0.1
+    assert len(moved) == 2

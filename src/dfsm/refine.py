@@ -33,6 +33,7 @@ from dfsm.progress import track
 from dfsm.rollout_error import RolloutError, record_of
 from dfsm.settings import require, settings
 from dfsm.signals import Provenance
+from dfsm.stability import fastest_growth
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.types import Array
 
@@ -141,7 +142,8 @@ def refine(
     Returns
     -------
     RefineResult
-        A refined model is never worse on the runs held out than its start.
+        A refined model is never worse on the runs held out than its start, and stable at all
+        schedule values if its start is.
 
     Raises
     ------
@@ -173,12 +175,12 @@ def refine(
         parameters = Parametrisation.of(with_latents, spread)
         final = RolloutError(parameters, held, choices.windows[-1], weights)
         at = np.zeros(parameters.size)
-    best = at
+    best, steady = at, _stability_kept(parameters)
     history: list[dict[str, float]] = []
     for stage, length in enumerate(choices.windows):
         problem = RolloutError(parameters, train, length, weights)
         check = RolloutError(parameters, held, length, weights)
-        at, found = _stage(problem, check, at, choices.iterations, late)
+        at, found = _stage(problem, check, at, choices.iterations, late, steady)
         history += [{"stage": stage, **entry} for entry in found]
         error = final.relative(at)
         if error < after:
@@ -201,6 +203,15 @@ def _weights(model: DFSM, choices: RefineSettings) -> Array:
     return np.array([choices.weights.get(n, 1.0) for n in names])
 
 
+def _stability_kept(parameters: Parametrisation) -> Callable[[Array], bool]:
+    """Whether a model is stable at all schedule values; always true if the start is not."""
+    s = parameters.model.signals
+    columns = slice(len(s.driving), len(s.driving) + len(s.states))
+    if fastest_growth(parameters.model.f, columns) > 0:
+        return lambda _: True
+    return lambda at: fastest_growth(parameters.at(jnp.asarray(at)).f, columns) <= 0
+
+
 # -- stages -------------------------------------------------------------------------------------
 
 
@@ -210,6 +221,7 @@ def _stage(
     start: Array,
     limit: int,
     late: Callable[[], bool],
+    steady: Callable[[Array], bool],
 ) -> tuple[Array, list[dict[str, float]]]:
     """Step until the validation windows no longer improve; the best weights and the history."""
     if not np.isfinite(problem.cost(start)):
@@ -221,7 +233,7 @@ def _stage(
     for count, step in enumerate(track(islice(steps, limit), "refining", limit), start=1):
         now = check.relative(step.weights)
         history.append({"training": problem.relative(step.weights), "validation": now})
-        if now < error:
+        if now < error and steady(step.weights):
             best, error, taken = step.weights, now, count
         if count - taken >= _PATIENCE or late():
             break

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,10 +17,13 @@ import numpy as np
 from scipy.linalg import eig
 
 from dfsm.errors import DfsmError
-from dfsm.linear import LinearFit
+from dfsm.linear import LinearFit, LinearModel
 from dfsm.types import Array, ComplexArray
 
 _STEPS = 200
+# Between two schedule points A is a mixture of theirs; it is looked at in as many places.
+_BETWEEN = 9
+_ROUNDS = 20
 
 
 def state_matrix(coefficients: Array, columns: slice, known: Mapping[int, int]) -> Array:
@@ -48,7 +52,8 @@ def stabilise(
     """Move eigenvalues right of ``-margin`` onto it, and refit everything else.
 
     The fitted rows of A change in the way that costs the least fit quality; kinematic rows stay.
-    Coefficients of all inputs that are not states are then fitted again with A held.
+    Coefficients of all inputs that are not states are then fitted again with A held. Where two
+    stable points leave an unstable mixture between them, both are moved further.
 
     Parameters
     ----------
@@ -75,6 +80,46 @@ def stabilise(
     """
     if not margin > 0:
         raise DfsmError(f"linear.margin is {margin:g}, expected a positive number of 1/s, or null")
+    margins = np.full(len(fit.equations), margin)
+    for _ in range(_ROUNDS):
+        stable, moved = _stable_points(fit, columns, known, margins, affine)
+        A = [state_matrix(L, columns, known) for L in np.asarray(stable.model.coefficients)]
+        excess = np.array([_between(a, b) + margin for a, b in pairwise(A)])
+        if (excess <= 0).all():
+            return stable, moved
+        for k in np.flatnonzero(excess > 0):
+            margins[k : k + 2] += 1.5 * excess[k]
+    raise DfsmError(
+        "no fit was found that is stable between the schedule points too: use fewer linear.points, "
+        "or a smaller linear.margin"
+    )
+
+
+def fastest_growth(model: LinearModel, columns: slice) -> float:
+    """Largest real part in 1/s of A's eigenvalues at all schedule values.
+
+    Parameters
+    ----------
+    model
+        Fit of all state derivatives.
+    columns
+        Input columns that are states.
+    """
+    A = np.asarray(model.coefficients)[:, :, columns]
+    at_points = max(float(np.linalg.eigvals(a).real.max()) for a in A)
+    return max([at_points, *(_between(a, b) for a, b in pairwise(A))])
+
+
+def _between(A: Array, B: Array) -> float:
+    """Largest real part of the eigenvalues of mixtures of two matrices."""
+    shares = np.linspace(0, 1, _BETWEEN + 2)[1:-1, None, None]
+    return float(np.linalg.eigvals((1 - shares) * A + shares * B).real.max())
+
+
+def _stable_points(
+    fit: LinearFit, columns: slice, known: Mapping[int, int], margins: Array, affine: bool
+) -> tuple[LinearFit, list[float]]:
+    """Every schedule point left of a margin of its own, and the points that had to be moved."""
     n = columns.stop - columns.start
     rows = [i for i in range(n) if i not in known]
     held = [*range(columns.start, columns.stop), *fit.constant]
@@ -82,7 +127,7 @@ def stabilise(
     offsets = np.array(fit.model.offsets)
     variance = np.zeros((len(offsets), offsets.shape[1]))
     moved = []
-    for k, equations in enumerate(fit.equations):
+    for k, (equations, margin) in enumerate(zip(fit.equations, margins, strict=True)):
         A = state_matrix(coefficients[k], columns, known)
         fixed = coefficients[k][:, held]
         variance[k] = equations.complete(held, fixed, affine)[2]
