@@ -128,7 +128,9 @@ def print_ranking(found: Ranking) -> None:
     console.print(_text(f"chosen on: {', '.join(found.validation)} (test the choice on others)"))
     if found.best is not None:
         console.print(
-            _text(f"best: {found.best.name}, use it with: dfsm summary {found.best.folder}")
+            _text(
+                f"best: {found.best.name}, its model is {found.best.folder}: dfsm validate it on other runs"
+            )
         )
 
 
