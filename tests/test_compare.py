@@ -65,6 +65,21 @@ def complaint(tmp_path, content) -> str:
     return str(caught.value).removeprefix(f"{path}: ")
 
 
+def wait_for(condition) -> None:
+    limit = time.monotonic() + 100
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+
+
+def group_lives(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 # -- ranking --------------------------------------------------------------------------------------
 
 
@@ -106,7 +121,7 @@ def test_the_score_is_that_of_validate(runs, tmp_path):
 
 
 def test_one_that_diverges_comes_after_all_that_do_not(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("dfsm.simulate._ESCAPE", 1.0)
+    monkeypatch.setattr(sys.modules["dfsm.simulate"], "_ESCAPE", 1.5)
     candidates = {"q": variant(states=(StateSpec(name="q"),)), "true": LINEAR}
     found = compare(candidates, runs, tmp_path / "c", validation=runs[:2], jobs=1)
     assert [c.status for c in found.candidates] == ["completed", "diverged"]
@@ -156,11 +171,7 @@ def test_a_killed_comparison_goes_on(here):
     command = [sys.executable, "-c", "from dfsm.cli import main; main()"]
     command += ["compare", "c.yaml", "-o", "out", "--jobs", "2", "--json"]
     process = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL)
-    limit = time.monotonic() + 100
-    while not list(Path("out").glob("*.json")):
-        assert process.poll() is None
-        assert time.monotonic() < limit
-        time.sleep(0.01)
+    wait_for(lambda: list(Path("out").glob("*.json")))
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     done = {p.stem for p in Path("out").glob("*.json")}
@@ -184,23 +195,22 @@ def test_ctrl_c_ends_the_workers(here):
     command = [sys.executable, "-c", "from dfsm.cli import main; main()"]
     command += ["compare", "c.yaml", "-o", "out", "--jobs", "2"]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True)
-    time.sleep(4.0)
+    wait_for(Path("out").exists)
+    time.sleep(1.0)
     # As a terminal does: to the whole group.
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err == "interrupted: nothing was left half-written\n"
-    time.sleep(0.5)
-    with pytest.raises(ProcessLookupError):
-        os.killpg(process.pid, 0)
+    wait_for(lambda: not group_lives(process.pid))
 
 
 # -- the command line -----------------------------------------------------------------------------
 
 
 def test_the_table_and_its_json(here, dfsm):
-    config = declared(q={"signals": {"states": [{"name": "q"}]}}, no={"signals": {"outputs": "x"}})
-    config["compare"]["candidates"]["no"] = {"signals": {"outputs": ["x[red]"]}}
+    unknown = {"signals": {"outputs": ["x[red]"]}}
+    config = declared(q={"signals": {"states": [{"name": "q"}]}}, no=unknown)
     write_config(Path("c.yaml"), config)
     shown = dfsm("compare", "c.yaml", "-o", "out", "--jobs", "1")
     assert (shown.code, shown.err) == (0, "")
@@ -210,7 +220,7 @@ def test_the_table_and_its_json(here, dfsm):
     assert 'signals.states = [{"name": "q"}]' in lines[2]
     assert re.search(r"candidate no could not be fitted: .*no channel 'x\[red\]'", shown.out)
     assert re.search(r"^trained on: \S+, \S+$", shown.out, re.MULTILINE)
-    assert re.search(r"^chosen on: [abc] ", shown.out, re.MULTILINE)
+    assert re.search(r"^chosen on: \S+ \(", shown.out, re.MULTILINE)
     assert lines[-1].startswith(f"best: base, its model is {Path('out') / 'base'}")
     assert dfsm("summary", "out/base").code == 0
     again = dfsm("compare", "c.yaml", "-o", "out", "--json")
@@ -262,18 +272,20 @@ def test_nothing_else_is_written_over(here, dfsm):
         (
             {"corrective": {"kind": "gb"}},
             "'compare.candidates.x.corrective.kind' is 'gb', expected one of 'rbf', "
-            "'rbf_incremental', 'gp', 'mlp', 'none'; did you mean 'gp'?",
+            "'rbf_incremental', 'gp', 'mlp', 'none'; known are: rbf, rbf_incremental, gp, mlp, "
+            "none",
         ),
         (
             {"corrective": {"kind": "gp", "hiden": 3}},
-            "unknown key 'compare.candidates.x.corrective.hiden'; known are: samples, sampling, "
-            "targets, kind",
+            "unknown key 'compare.candidates.x.corrective.hiden'; known are: kind, samples, "
+            "sampling, targets",
         ),
         ({"sed": 3}, "unknown key 'compare.candidates.x.sed'; did you mean 'seed'?"),
         ({"linear": {"kind": "LPV"}}, "key 'compare.candidates.x.linear.schedule' is missing"),
         (
             {"refine": {"latents": 3}},
-            "compare.candidates.x: refine.latents is 3, expected an even number: they come in pairs",
+            "compare.candidates.x: refine.latents is 3, expected an even number: they come in "
+            "pairs",
         ),
         (
             {"data": {"start": 3}},

@@ -127,11 +127,8 @@ def print_ranking(found: Ranking) -> None:
     console.print(_text(f"trained on: {', '.join(found.training)}"))
     console.print(_text(f"chosen on: {', '.join(found.validation)} (test the choice on others)"))
     if found.best is not None:
-        console.print(
-            _text(
-                f"best: {found.best.name}, its model is {found.best.folder}: dfsm validate it on other runs"
-            )
-        )
+        use = f"its model is {found.best.folder}: dfsm validate it on other runs"
+        console.print(_text(f"best: {found.best.name}, {use}"))
 
 
 def print_article(article: Article) -> None:
