@@ -1,6 +1,6 @@
 """Run the measurements and print one JSON object.
 
-python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling]
+python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [control]
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import platform
 import warnings
 
 import dfsm
-from benchmarks import accuracy, derivatives, parameters, scaling, speed
+from benchmarks import accuracy, control, derivatives, parameters, rollouts, scaling, speed
 from dfsm.files import json_value
 
 PARTS = {
@@ -21,6 +21,8 @@ PARTS = {
     "speed": speed.run,
     "parameters": parameters.run,
     "scaling": scaling.run,
+    "rollouts": rollouts.run,
+    "control": control.run,
 }
 
 

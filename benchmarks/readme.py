@@ -12,19 +12,21 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-FILES = (ROOT / "README.md", ROOT / "docs" / "method.md")
+DOCS = ROOT / "docs"
+FILES = (ROOT / "README.md", DOCS / "method.md", DOCS / "floating-turbine.md")
 
 
 def accuracy_table(figures: Mapping[str, Any], variant: str = "multi-fidelity") -> list[str]:
-    """Mean NRMSE per model and channel; a dash where a rollout ended early."""
+    """Mean NRMSE per model and channel; a dash where a rollout ended early or has no such state."""
     models = {label: found[variant] for label, found in figures.items()}
-    channels = list(next(iter(models.values()))["nrmse"])
+    channels = list(dict.fromkeys(c for found in models.values() for c in found["nrmse"]))
     lines = [
         "| model | rollouts completed | " + " | ".join(channels) + " |",
         "|---|---|" + "---|" * len(channels),
     ]
     for label, found in models.items():
-        cells = ["–" if v is None else f"{v:.2f}" for v in found["nrmse"].values()]
+        errors = [found["nrmse"].get(c) for c in channels]
+        cells = ["–" if v is None else f"{v:.2f}" for v in errors]
         done = f"{found['completed']} of {found['of']}"
         lines.append(f"| {label} | {done} | " + " | ".join(cells) + " |")
     return lines
@@ -115,6 +117,62 @@ def _scaling_costs(found: Mapping[str, Any]) -> str:
     return f"{training} / " + ("–" if ratio is None else f"{ratio:.2g} ×")
 
 
+def rollouts_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors of every step from the paper's recipe on."""
+    lines = [
+        "| model | pitch | pitch rate | rotor speed | perturbed: pitch, speed | diverged | fit |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, found in figures["models"].items():
+        closed, other = found["closed loop"], found["perturbed"]
+        states = ("PtfmPitch", "PtfmPitch_dot", "GenSpeed")
+        cells = [f"{_two(closed['filtered'][c])} ({_two(closed['unfiltered'][c])})" for c in states]
+        cells.append(", ".join(_two(other["filtered"][c]) for c in (states[0], states[2])))
+        cells.append(f"{closed['diverged'] + other['diverged']} of {closed['of'] + other['of']}")
+        cells.append(f"{found['fit_s']:.0f} s")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+def _two(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def loads_table(figures: Mapping[str, Any]) -> list[str]:
+    """Tower-base loads of the last model, run by run."""
+    lines = [
+        "| run, load | NRMSE (below 0.5 Hz) | damage-equivalent load | power 0–0.3 Hz | power 3P "
+        "| peaks off by bins: platform, wave |",
+        "|---|---|---|---|---|---|",
+    ]
+    for run, loads in figures["loads"].items():
+        for load, found in loads.items():
+            power, bins = found["power_ratio"], found["peak_bins"]
+            cells = [
+                f"{found['nrmse']:.2f} ({found['nrmse_filtered']:.2f})",
+                f"{found['del_ratio']:.2f}",
+                f"{power['0-0.3 Hz']:.2f}",
+                f"{power['3P']:.2f}",
+                ", ".join("–" if b is None else f"{b:.0f}" for b in bins.values()),
+            ]
+            lines.append(f"| {run.removeprefix('iea15_2dof_')}, {load} | {' | '.join(cells)} |")
+    return lines
+
+
+def sweep_table(figures: Mapping[str, Any]) -> list[str]:
+    """The sweep of constant winds in one line per figure."""
+    found = figures["sweep"]
+    reach = max(found.values(), key=lambda f: f["half_ranges"])["half_ranges"]
+    drift = max(f["drift"] for f in found.values())
+    done = sum(f["completed"] for f in found.values())
+    return [
+        "| constant winds | simulated to the end | farthest from the middle | drift at last |",
+        "|---|---|---|---|",
+        f"| {' to '.join((next(iter(found)), list(found)[-1]))} m/s | {done} of {len(found)} | "
+        f"{reach:.2f} half-ranges | {drift:.0e} standard deviations per s |",
+    ]
+
+
 TABLES = {
     "accuracy": accuracy_table,
     "speed": speed_table,
@@ -122,6 +180,7 @@ TABLES = {
     "parameters": parameters_table,
     "scaling": scaling_table,
 }
+ROLLOUT_TABLES = {"rollouts": rollouts_table, "loads": loads_table, "sweep": sweep_table}
 
 
 def fill(path: Path, tables: Mapping[str, list[str]]) -> None:
@@ -140,6 +199,9 @@ def main() -> None:
     """Write the tables that the figures hold."""
     figures = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     tables = {name: table(figures[name]) for name, table in TABLES.items() if name in figures}
+    if "rollouts" in figures:
+        for name, table in ROLLOUT_TABLES.items():
+            tables[name] = table(figures["rollouts"])
     for path in FILES:
         fill(path, tables)
     if "scaling" in figures:

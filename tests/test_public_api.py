@@ -135,7 +135,18 @@ def test_settings_are_frozen_and_keyword_only(name):
 
 
 def test_importing_costs_nothing():
-    heavy = ["jax", "pandas", "scipy", "sklearn", "plotly", "pyarrow", "diffrax", "numpy", "rich"]
+    heavy = [
+        "jax",
+        "casadi",
+        "pandas",
+        "scipy",
+        "sklearn",
+        "plotly",
+        "pyarrow",
+        "diffrax",
+        "numpy",
+        "rich",
+    ]
     code = f"import sys, dfsm; print([m for m in {heavy!r} if m in sys.modules])"
     assert python(code) == "[]"
     heavy.remove("rich")

@@ -15,12 +15,23 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from dfsm.compare import RankedCandidate, Ranking, compare
     from dfsm.config import load_config
+    from dfsm.control import (
+        DirectTranscription,
+        MultipleShooting,
+        OptimalControlProblem,
+        SingleShooting,
+        Solution,
+        load_solution,
+        save_solution,
+        solve,
+    )
     from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
     from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.errors import DfsmError, DfsmWarning
     from dfsm.excitation import Chirp, Multisine, RandomKnots, RandomSteps, Uniform, excite
     from dfsm.features import Feature
     from dfsm.fit import FitResult, fit
+    from dfsm.intervals import Intervals, calibrate
     from dfsm.linear import LPV, LTI
     from dfsm.model import DFSM
     from dfsm.progress import show_progress
@@ -110,6 +121,16 @@ _HOME = {
     "RankedCandidate": "compare",
     "Ranking": "compare",
     "compare": "compare",
+    "calibrate": "intervals",
+    "Intervals": "intervals",
+    "OptimalControlProblem": "control",
+    "DirectTranscription": "control",
+    "MultipleShooting": "control",
+    "SingleShooting": "control",
+    "solve": "control",
+    "Solution": "control",
+    "save_solution": "control",
+    "load_solution": "control",
     "write_report": "report",
     "load_config": "config",
 }

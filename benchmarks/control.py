@@ -1,0 +1,190 @@
+"""Optimal control: known problems, orders of convergence, and time per iteration on a turbine.
+
+The turbine is a stand-in of the size of the paper's problem (Sec. 4): a surrogate with 4 states, 2
+controls, coefficients scheduled in the wind and 200 Gaussian units in two rows, 600 s, trapezoidal.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.known_problems import PROBLEMS
+from dfsm.control import (
+    DirectTranscription,
+    MultipleShooting,
+    OptimalControlProblem,
+    Solution,
+    solve,
+)
+from dfsm.control.schemes import Kind
+from dfsm.corrective import GaussianUnits
+from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.linear import LinearModel
+from dfsm.model import DFSM
+from dfsm.signals import Region, SignalTable
+from dfsm.trajectory import Channel, Trajectory
+
+POINTS = (250, 500, 1000, 2000, 4000, 8000)
+# Schemes with the order that theory gives them on smooth problems.
+ORDERS: dict[str, tuple[Kind, int, int]] = {
+    "trapezoidal": ("trapezoidal", 1, 2),
+    "hermite_simpson": ("hermite_simpson", 1, 4),
+    "radau 2": ("radau", 2, 3),
+    "radau 3": ("radau", 3, 5),
+}
+SMOOTH = ("Hager1", "HagerHouRao1")
+SHOT = ("Hager1", "Vanderpol", "Brachistochrone", "HagerHouRao1", "TwoLinkRobot, energy")
+
+
+def run() -> dict[str, Any]:
+    """Measure all three.
+
+    Returns
+    -------
+    dict
+        ``known``: per problem and method the objective, its relative error, iterations and
+        seconds to solve; ``orders``: per smooth problem and scheme the errors on 5 to 40 intervals;
+        ``turbine``: per number of points the iterations and milliseconds per iteration.
+    """
+    return {"known": known(), "orders": orders(), "turbine": turbine_times()}
+
+
+def known() -> dict[str, Any]:
+    """Solve the problems with known answers, from straight lines."""
+    found: dict[str, Any] = {}
+    for name, make in PROBLEMS.items():
+        case = make()
+        methods: dict[str, Any] = {
+            "hermite_simpson": DirectTranscription(),
+            "radau": DirectTranscription(scheme="radau"),
+        }
+        if name in SHOT:
+            methods["multiple_shooting"] = MultipleShooting()
+        found[name] = {
+            label: _figures(solve(case.problem, method, case.guess, simulate=False), case.value)
+            for label, method in methods.items()
+        }
+    return found
+
+
+def _figures(found: Solution, value: float) -> dict[str, Any]:
+    return {
+        "ending": found.ending.name,
+        "objective": found.objective,
+        "relative_error": abs(found.objective - value) / abs(value),
+        "iterations": found.iterations,
+        "intervals": found.grid.intervals,
+        "seconds": found.seconds["solve"],
+        "seconds_compile": found.seconds["compile"],
+    }
+
+
+def orders(meshes: tuple[int, ...] = (5, 10, 20, 40)) -> dict[str, Any]:
+    """Relative errors of the objective on finer and finer meshes, and the order they show."""
+    found: dict[str, Any] = {}
+    for name in SMOOTH:
+        case = PROBLEMS[name]()
+        for label, (kind, degree, order) in ORDERS.items():
+            errors = []
+            for mesh in meshes:
+                method = DirectTranscription(scheme=kind, degree=degree, mesh=mesh, refine=None)
+                solution = solve(case.problem, method, case.guess, simulate=False)
+                errors.append(abs(solution.objective / case.value - 1))
+            # The last meshes may have reached the solver's tolerance.
+            shown = np.log2(np.array(errors[:-1]) / np.maximum(errors[1:], 1e-15))
+            found[f"{name}, {label}"] = {
+                "theory": order,
+                "errors": errors,
+                "orders": [float(v) for v in shown],
+            }
+    return found
+
+
+def turbine_times(points: tuple[int, ...] = POINTS) -> dict[str, Any]:
+    """Milliseconds per iteration of IPOPT, compilation left out, with the number of points."""
+    problem, found = turbine(), {}
+    for count in points:
+        method = DirectTranscription(
+            scheme="trapezoidal", mesh=count - 1, refine=None, tolerance=1e-7
+        )
+        solution = solve(problem, method, simulate=False)
+        found[str(count)] = {
+            "ending": solution.ending.name,
+            "iterations": solution.iterations,
+            "ms_per_iteration": 1e3 * solution.seconds["solve"] / solution.iterations,
+        }
+    return found
+
+
+# -- a stand-in for the floating turbine --------------------------------------------------------
+
+# Ranges of torque (MN m), blade pitch (deg), wind (m/s), platform pitch (deg), speed (rpm), rates.
+_LOW = np.array([0.0, -2.0, 3.0, -3.0, 1.0, -1.0, -0.5])
+_HIGH = np.array([21.0, 25.0, 25.0, 9.0, 9.0, 1.0, 0.5])
+
+
+def turbine() -> OptimalControlProblem:
+    """Most power with little pitching in 600 s of unsteady wind, bounds as in the paper."""
+    time = np.arange(0, 600.01, 0.05)
+    wind = 12 + 2 * np.sin(0.03 * time) + 1.5 * np.sin(0.11 * time + 1) + 0.7 * np.sin(0.7 * time)
+    return OptimalControlProblem(
+        model=_turbine_model(),
+        horizon=(0.0, 600.0),
+        disturbances=Trajectory(time, wind[:, None], (Channel("wind", "m/s"),), name="wind"),
+        cost=lambda s: -0.99 * s.u.torque * s.x.speed + 1e-5 * s.u.torque**2 + 0.5 * s.u.blade**2,
+        bounds={
+            "torque": (1.67, 19.9),
+            "blade": (0.0, 22.6),
+            "pitch": (0.0, 6.0),
+            "speed": (1.9, 7.2),
+        },
+        name="turbine",
+    )
+
+
+def _turbine_model(units: int = 200) -> DFSM:
+    rng = np.random.default_rng(0)
+    winds = np.linspace(4, 24, 6)
+    coefficients = np.zeros((len(winds), 4, 7))
+    coefficients[:, 0, 5] = coefficients[:, 1, 6] = 1
+    coefficients[:, 2] = [0.0, -0.01, 0.0, -0.04, -0.002, -0.08, 0.01]
+    coefficients[:, 2, 2] = 0.0004 * winds
+    coefficients[:, 3] = [-0.02, -0.06, 0.03, 0.001, -0.15, 0.02, -0.9]
+    offsets = np.zeros((len(winds), 4))
+    offsets[:, 2], offsets[:, 3] = 0.1, 0.03 * winds + 0.6
+    middle, half = (_LOW + _HIGH) / 2, (_HIGH - _LOW) / 2
+    region = Region(
+        *map(jnp.asarray, (_LOW, _HIGH, middle, half / 2, winds, np.tile(middle, (6, 1))))
+    )
+    return DFSM(
+        f=LinearModel(jnp.asarray(winds), jnp.asarray(coefficients), jnp.asarray(offsets), 2),
+        e=GaussianUnits(
+            shift=jnp.asarray(middle),
+            scale=jnp.asarray(1.5 * half),
+            centres=jnp.asarray(rng.uniform(-0.6, 0.6, (7, units))),
+            weights=jnp.asarray(2e-4 * rng.standard_normal((2, units))),
+            bias=jnp.zeros(2),
+        ),
+        g=None,
+        e_g=None,
+        region=region,
+        corrected=(2, 3),
+        corrected_outputs=(),
+        signals=SignalTable(
+            states=(
+                Channel("pitch", "deg"),
+                Channel("speed", "rpm"),
+                Channel("pitch_rate", "deg/s"),
+                Channel("speed_rate", "rpm/s"),
+            ),
+            controls=(Channel("torque", "MN m"), Channel("blade", "deg")),
+            disturbances=(Channel("wind", "m/s"),),
+            parameters=(),
+            outputs=(),
+            specs=(StateSpec(name="pitch", order=2), StateSpec(name="speed", order=2)),
+            derivatives=DerivativeSettings(),
+        ),
+    )

@@ -1,0 +1,28 @@
+"""Open-loop optimal control with a surrogate, or with any model that JAX can follow (Sec. 4).
+
+`problem` says what, `transcription` and `shooting` how; behind them `program` assembles sparse
+nonlinear programs and `nlp` gives them to IPOPT.
+"""
+
+from dfsm.control.problem import OptimalControlProblem
+from dfsm.control.shooting import MultipleShooting, SingleShooting
+from dfsm.control.signals import End, Signals
+from dfsm.control.solution import Ending, Replay, Solution
+from dfsm.control.solve import solve
+from dfsm.control.storage import load_solution, save_solution
+from dfsm.control.transcription import DirectTranscription
+
+__all__ = [
+    "DirectTranscription",
+    "End",
+    "Ending",
+    "MultipleShooting",
+    "OptimalControlProblem",
+    "Replay",
+    "Signals",
+    "SingleShooting",
+    "Solution",
+    "load_solution",
+    "save_solution",
+    "solve",
+]

@@ -1,0 +1,394 @@
+"""OptimalControlProblem: what to minimise, subject to what, in names and units of a model.
+
+    minimise   M(start, end) + ∫ L(s) dt
+    subject to ẋ = f̂(x, u, w, p), path and boundary constraints, bounds and rates
+
+over controls u, states x, free parameters p and a free final time (Sec. 4). How it is solved is
+the business of `solve` and its methods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from dfsm.control.signals import GROUPS, Plant, plant_of
+from dfsm.errors import DfsmError, near_matches
+from dfsm.model import DFSM
+from dfsm.settings import require
+from dfsm.signals import with_computed
+from dfsm.simulators import ODESystem
+from dfsm.trajectory import Trajectory
+from dfsm.types import Array
+
+# A number, None for no limit, a function of time (array in, array out), or a run with the channel.
+Level = float | None | Callable[[Array], Any] | Trajectory
+Interval = tuple[Level, Level]
+Constraint = tuple[Callable[..., Any], Level, Level]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OptimalControlProblem:
+    """An open-loop optimal control problem.
+
+    Costs and path constraints are functions of one argument `s` with named signals at one time,
+    for example ``lambda s: -s.x.GenSpeed * s.u.GenTq``; see `Signals`. Final costs and boundary
+    constraints are functions of the two ends, for example ``lambda start, end: end.t``; see `End`.
+    All are written with jax.numpy, for exact derivatives.
+
+    Attributes
+    ----------
+    model
+        A surrogate, or a system of known equations: ``ODESystem(f, states=…, controls=…)`` makes
+        one of any JAX function f(x, u, w, p).
+    horizon
+        First and last time in s. A pair in place of the last time makes it free between the two.
+    cost
+        L, integrated over the horizon.
+    final_cost
+        M, a function of both ends.
+    bounds
+        ``name: (low, high)`` for states, controls and outputs, in their units. A limit is a
+        number, None, a function of time (array in, array out), or a run that holds the channel.
+    rates
+        ``name: (low, high)`` for the rates of controls, in their units per second.
+    initial, final
+        ``name: value`` fixes a state at that end, ``name: (low, high)`` bounds it, and a state
+        that is not named is free within its bounds.
+    constraints
+        ``name: (function, low, high)``, path constraints; a function may return a vector.
+    boundary
+        ``name: (function, low, high)``, constraints on both ends.
+    parameters
+        ``name: value`` fixes a plant parameter, ``name: (low, high)`` leaves it to the optimiser.
+    disturbances
+        Known over the whole horizon, linear between samples. Several runs are several scenarios:
+        each has its own states and controls, all share the free parameters and the final time.
+    weights
+        Of the scenarios in the cost; None weighs all the same. They are scaled to a sum of 1.
+    name
+        For messages.
+
+    Raises
+    ------
+    DfsmError
+        Unknown names, bounds that cross, disturbances shorter than the horizon, and the like.
+    """
+
+    model: DFSM | ODESystem
+    horizon: tuple[float, float | tuple[float, float]]
+    cost: Callable[..., Any] | None = None
+    final_cost: Callable[..., Any] | None = None
+    bounds: Mapping[str, Interval] = field(default_factory=dict)
+    rates: Mapping[str, Interval] = field(default_factory=dict)
+    initial: Mapping[str, float | tuple[float | None, float | None]] = field(default_factory=dict)
+    final: Mapping[str, float | tuple[float | None, float | None]] = field(default_factory=dict)
+    constraints: Mapping[str, Constraint] = field(default_factory=dict)
+    boundary: Mapping[str, Constraint] = field(default_factory=dict)
+    parameters: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    disturbances: Trajectory | Sequence[Trajectory] | None = None
+    weights: Sequence[float] | None = None
+    name: str = "problem"
+
+    def __post_init__(self) -> None:
+        _check_names(self)
+        _check_pairs(self)
+        _check_horizon(self)
+        _check_disturbances(self)
+        _check_limits(self)
+        if self.cost is None and self.final_cost is None:
+            raise DfsmError(f"{self.name}: nothing to minimise: give a cost or a final_cost")
+        if self.weights is not None:
+            count, given = len(self.scenarios), np.asarray(self.weights, dtype=float)
+            require(
+                given.shape == (count,) and bool((given > 0).all()),
+                f"{self.name}: weights",
+                list(self.weights),
+                f"{count} positive numbers, one per scenario",
+            )
+
+    # -- what follows from the fields -----------------------------------------------------------
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The model's channels and functions."""
+        return plant_of(self.model)
+
+    @property
+    def start(self) -> float:
+        """First time in s."""
+        return float(self.horizon[0])
+
+    @property
+    def free_time(self) -> tuple[float, float] | None:
+        """Limits of a free last time in s, else None."""
+        stop = self.horizon[1]
+        return (float(stop[0]), float(stop[1])) if isinstance(stop, tuple) else None
+
+    @property
+    def last_time(self) -> float:
+        """The last time in s, or the latest one allowed."""
+        stop = self.horizon[1]
+        return float(stop[1] if isinstance(stop, tuple) else stop)
+
+    @property
+    def free_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that are left to the optimiser, in the model's order."""
+        names = self.plant.names("parameters")
+        return tuple(n for n in names if not is_number(self.parameters[n]))
+
+    @cached_property
+    def scenarios(self) -> tuple[Trajectory | None, ...]:
+        """Disturbances of every scenario; a single None where there are none."""
+        if self.disturbances is None:
+            return (None,)
+        if isinstance(self.disturbances, Trajectory):
+            return (self._completed(self.disturbances),)
+        return tuple(self._completed(run) for run in self.disturbances)
+
+    def _completed(self, run: Trajectory) -> Trajectory:
+        """Add the disturbances that a surrogate computes from others, where the run lacks any."""
+        names = self.plant.names("disturbances")
+        if not isinstance(self.model, DFSM) or all(n in run for n in names):
+            return run
+        return with_computed(run, self.model.signals.hub_height, self.model.signals.features)
+
+    @property
+    def scenario_weights(self) -> Array:
+        """Weights with a sum of 1, shape ``(scenario,)``."""
+        count = len(self.scenarios)
+        given = np.ones(count) if self.weights is None else np.asarray(self.weights, dtype=float)
+        return given / given.sum()
+
+    def limits(self, name: str, time: Array) -> tuple[Array, Array]:
+        """Lower and upper bound of a state, control or output at times in s, infinite if none."""
+        low, high = self.bounds.get(name, (None, None))
+        return level(low, name, time, -np.inf), level(high, name, time, np.inf)
+
+    def end_limits(self, which: str, name: str) -> tuple[float, float]:
+        """Lower and upper bound of a state at the ``"initial"`` or ``"final"`` time."""
+        given = getattr(self, which).get(name, (None, None))
+        if is_number(given):
+            return float(given), float(given)
+        low, high = given
+        return (-np.inf if low is None else float(low), np.inf if high is None else float(high))
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether a value is one number, and not a pair."""
+    return isinstance(value, int | float | np.number)
+
+
+def level(given: Level, name: str, time: Array, default: float) -> Array:
+    """Evaluate a limit at times in s.
+
+    Parameters
+    ----------
+    given
+        See `OptimalControlProblem.bounds`.
+    name
+        Channel to take from a run.
+    time
+        Shape ``(time,)``.
+    default
+        Stands for None.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(time,)``.
+
+    Raises
+    ------
+    DfsmError
+        The limit gives another number of values.
+    """
+    if given is None:
+        return np.full(len(time), default)
+    if isinstance(given, Trajectory):
+        return given.select([name]).resample(time).values[:, 0]
+    value = np.asarray(given(time) if callable(given) else given, dtype=np.float64)
+    if value.shape not in ((), np.shape(time)):
+        raise DfsmError(
+            f"a limit of '{name}' has shape {value.shape} at {len(time)} times: a function of time "
+            "takes an array and returns one number or one per time"
+        )
+    return np.broadcast_to(value, np.shape(time)).copy()
+
+
+# -- checks -------------------------------------------------------------------------------------
+
+
+def _check_names(problem: OptimalControlProblem) -> None:
+    plant, name = problem.plant, problem.name
+    places = {
+        "bounds": ("states", "controls", "outputs"),
+        "rates": ("controls",),
+        "initial": ("states",),
+        "final": ("states",),
+        "parameters": ("parameters",),
+    }
+    for place, groups in places.items():
+        known = [n for g in groups for n in plant.names(g)]
+        for asked in getattr(problem, place):
+            if asked in known:
+                continue
+            owner = plant.owner(asked)
+            if owner is not None:
+                wanted = f"'{asked}' is one of the {GROUPS[owner]}, expected {' or '.join(groups)}"
+                raise DfsmError(f"{name}: {place}: {wanted}")
+            raise DfsmError(f"{name}: {place}: no channel '{asked}'; {near_matches(asked, known)}")
+    for parameter in plant.names("parameters"):
+        if parameter not in problem.parameters:
+            raise DfsmError(
+                f"{name}: parameter '{parameter}' has no value: give parameters={{'{parameter}': "
+                "value}, or a pair (low, high) to optimise it"
+            )
+    for place in ("constraints", "boundary"):
+        for key, given in getattr(problem, place).items():
+            if not (isinstance(given, tuple) and len(given) == 3 and callable(given[0])):
+                raise DfsmError(
+                    f"{name}: {place} '{key}' is {given!r}, expected (function, low, high)"
+                )
+
+
+def _check_pairs(problem: OptimalControlProblem) -> None:
+    """Refuse what is not of the form that its field asks for."""
+    for place, number, limits in (
+        ("bounds", False, _is_level),
+        ("rates", False, _is_level),
+        ("initial", True, _is_limit),
+        ("final", True, _is_limit),
+        ("parameters", True, is_number),
+    ):
+        for key, given in getattr(problem, place).items():
+            pair = isinstance(given, tuple) and len(given) == 2 and all(map(limits, given))
+            if not (pair or (number and is_number(given))):
+                raise DfsmError(
+                    f"{problem.name}: {place} of '{key}' are {given!r}, expected "
+                    + ("a number or " if number else "")
+                    + "a pair (low, high)"
+                )
+    horizon = problem.horizon
+    last = horizon[1] if isinstance(horizon, tuple) and len(horizon) == 2 else None
+    free = isinstance(last, tuple) and len(last) == 2 and all(map(is_number, last))
+    if not (is_number(last) or free) or not is_number(horizon[0]):
+        raise DfsmError(
+            f"{problem.name}: the horizon is {horizon!r}, expected (first, last) or (first, "
+            "(earliest last, latest last)) in s"
+        )
+
+
+def _is_limit(given: object) -> bool:
+    return given is None or is_number(given)
+
+
+def _is_level(given: object) -> bool:
+    return _is_limit(given) or callable(given) or isinstance(given, Trajectory)
+
+
+def _check_horizon(problem: OptimalControlProblem) -> None:
+    name, start, free = problem.name, problem.start, problem.free_time
+    low, high = free or (problem.last_time, problem.last_time)
+    if not (np.isfinite([start, low, high]).all() and start < high and low <= high):
+        raise DfsmError(
+            f"{name}: the horizon is {problem.horizon}, expected (first, last) or (first, "
+            "(earliest last, latest last)) in s, increasing"
+        )
+    if free is not None and low <= start:
+        raise DfsmError(
+            f"{name}: the free last time may be {low:g} s, which is not after the first, "
+            f"{start:g} s: raise its lower limit"
+        )
+    moving = [n for n, pair in problem.bounds.items() if not all(map(_constant, pair))]
+    moving += [n for n, pair in problem.rates.items() if not all(map(_constant, pair))]
+    moving += [n for n, given in problem.constraints.items() if not all(map(_constant, given[1:]))]
+    if free is not None and moving:
+        raise DfsmError(
+            f"{name}: the limits of '{moving[0]}' vary in time, which needs a fixed last time: "
+            "write a path constraint that uses s.t"
+        )
+
+
+def _constant(given: Level) -> bool:
+    return given is None or not (callable(given) or isinstance(given, Trajectory))
+
+
+def _check_disturbances(problem: OptimalControlProblem) -> None:
+    names, name = problem.plant.names("disturbances"), problem.name
+    runs = [r for r in problem.scenarios if r is not None]
+    if names and not runs:
+        raise DfsmError(f"{name}: the disturbances {', '.join(names)} are missing: give a run")
+    for run in runs:
+        chosen = run.select(names)
+        start, stop = float(run.time[0]), float(run.time[-1])
+        slack = 1e-9 * run.duration
+        if start > problem.start + slack or stop < problem.last_time - slack:
+            raise DfsmError(
+                f"{name}: the disturbances of {run.where} last from {start:g} s to {stop:g} s, the "
+                f"horizon from {problem.start:g} s to {problem.last_time:g} s: give a longer run "
+                "or a shorter horizon"
+            )
+        chosen.require_finite()
+
+
+def _check_limits(problem: OptimalControlProblem) -> None:
+    """Refuse bounds that cross, ends outside bounds, and bounds outside the training region."""
+    time = np.linspace(problem.start, problem.last_time, 201)
+    for place in ("bounds", "rates", "constraints", "boundary"):
+        for key, given in getattr(problem, place).items():
+            # A limit may be infinite but not undefined.
+            low = level(given[-2], key, time, -np.inf)
+            high = level(given[-1], key, time, np.inf)
+            crossed = ~(low <= high)
+            if crossed.any():
+                at = int(np.argmax(crossed))
+                raise DfsmError(
+                    f"{problem.name}: {place} of '{key}' go from {low[at]:g} to {high[at]:g} at "
+                    f"{time[at]:g} s: the lower limit must not be above the upper one"
+                )
+    for which, at in (("initial", 0), ("final", -1)):
+        for key in getattr(problem, which):
+            low, high = problem.end_limits(which, key)
+            below, above = (b[at] for b in problem.limits(key, time))
+            slack = 1e-9 * max(1.0, abs(low), abs(high))
+            if not (low <= high and max(low, below) <= min(high, above) + slack):
+                raise DfsmError(
+                    f"{problem.name}: the {which} '{key}' is to be in {_told(low, high)}, its "
+                    f"bounds are {_told(below, above)}: no value meets both"
+                )
+    for key in problem.free_parameters:
+        given = problem.parameters[key]
+        low, high = given if isinstance(given, tuple) else (given, given)
+        if not (np.isfinite([low, high]).all() and low <= high):
+            raise DfsmError(
+                f"{problem.name}: parameter '{key}' is to be in {_told(low, high)}, expected two "
+                "finite limits that do not cross"
+            )
+    _check_region(problem, time)
+
+
+def _check_region(problem: OptimalControlProblem, time: Array) -> None:
+    plant = problem.plant
+    if plant.region is None:
+        return
+    names = [n for g in ("controls", "disturbances", "states") for n in plant.names(g)]
+    trained = dict(zip(names, np.stack([plant.region.low, plant.region.high], 1), strict=False))
+    for key in problem.bounds:
+        if key in trained:
+            (below, above), (low, high) = problem.limits(key, time), trained[key]
+            if (below > high).any() or (above < low).any():
+                at = int(np.argmax((below > high) | (above < low)))
+                raise DfsmError(
+                    f"{problem.name}: bounds of '{key}' are {_told(below[at], above[at])} at "
+                    f"{time[at]:g} s, outside the model's training range {_told(low, high)}: "
+                    "change the bounds, or train on runs that reach them"
+                )
+
+
+def _told(low: float, high: float) -> str:
+    return f"{low:.5g}" if low == high else f"[{low:.5g}, {high:.5g}]"

@@ -1,0 +1,218 @@
+"""Solution: optimal trajectories, what they cost, how the solver ended, and what to do then."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dfsm.control.grid import Grid
+from dfsm.errors import printable
+from dfsm.trajectory import Trajectory
+from dfsm.types import Array
+
+
+class Ending(enum.Enum):
+    """How a solve ended; the value says what it means and what to do."""
+
+    SOLVED = "solved"
+    ACCEPTABLE = (
+        "solved to a looser tolerance than asked, because no step improved it: check the scaling "
+        "of bounds and costs, or loosen tolerance"
+    )
+    COARSE = (
+        "solved on the last mesh, whose local error is still above what was asked: raise "
+        "most_refinements, or loosen refine"
+    )
+    INFEASIBLE = (
+        "no feasible point was found: the constraints named here conflict, widen one of them or "
+        "start from another guess"
+    )
+    LIMIT = (
+        "the iteration limit was reached, this is the best iterate: raise most_iterations, or "
+        "start from a better guess"
+    )
+    INTERRUPTED = "interrupted, this is the best iterate so far: solve again with it as guess"
+    NOT_FINITE = (
+        "a function became NaN or infinite and the solver could not avoid it: bound the variables "
+        "so that the function is defined wherever they may go"
+    )
+    FAILED = (
+        "the solver gave up: start from a better guess, scale costs to the order of one, or try "
+        "another scheme"
+    )
+
+    @property
+    def solved(self) -> bool:
+        """Whether the result satisfies the optimality conditions on its mesh."""
+        return self in (Ending.SOLVED, Ending.ACCEPTABLE, Ending.COARSE)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The optimal controls in an adaptive integrator, from the optimal initial state.
+
+    Attributes
+    ----------
+    trajectory
+        States at the nodes.
+    deviation
+        Largest difference to the solution's states, by name, in their units.
+    relative
+        The largest of them relative to the largest value of its state.
+    """
+
+    trajectory: Trajectory
+    deviation: Mapping[str, float]
+    relative: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What `solve` found.
+
+    Attributes
+    ----------
+    name
+        Of the problem.
+    ending
+        How the solver ended.
+    reason
+        For a solve that did not succeed: the worst constraint by name and time, and the bounds
+        that hold it; else "".
+    objective, final_cost, integral_cost
+        M + ∫ L dt and its two parts, weighted over the scenarios.
+    trajectories
+        Per scenario: states, controls, disturbances, parameters and outputs at the nodes, with
+        units and roles. The last time is the optimal one.
+    costates
+        Per scenario: multipliers of the dynamics, ∂J/∂ξ, in the objective's unit per unit of each
+        state.
+    multipliers
+        Of path and boundary constraints by name, shape ``(scenario × time,)``, in the
+        objective's unit per unit of the constraint.
+    parameters
+        All plant parameters, optimised or not.
+    grid
+        The mesh and its scheme.
+    error
+        Largest relative local error of an interval.
+    meshes
+        Per mesh tried: ``intervals``, ``objective``, ``error``, ``iterations``.
+    iterations
+        Of the solver, on all meshes together.
+    seconds
+        ``compile`` and ``solve``.
+    linear_quadratic
+        Whether the problem was recognised as linear-quadratic and solved as such.
+    violation
+        Largest violation of a constraint, relative to its size.
+    outside
+        Share of the horizon with any input outside the training range; None without a surrogate.
+    replays
+        Per scenario, see `Replay`; empty where it was not asked for.
+    solver_state
+        Scaled multipliers, to start the same mesh warm.
+    """
+
+    name: str
+    ending: Ending
+    reason: str
+    objective: float
+    final_cost: float
+    integral_cost: float
+    trajectories: tuple[Trajectory, ...]
+    costates: tuple[Trajectory, ...]
+    multipliers: Mapping[str, Array]
+    parameters: Mapping[str, float]
+    grid: Grid
+    error: float
+    meshes: tuple[Mapping[str, Any], ...]
+    iterations: int
+    seconds: Mapping[str, float]
+    linear_quadratic: bool
+    violation: float
+    outside: float | None
+    replays: tuple[Replay, ...] = ()
+    solver_state: Array = field(default_factory=lambda: np.empty(0))
+
+    def __repr__(self) -> str:
+        t = self.trajectory
+        return (
+            f"<Solution of {printable(self.name)}: {self.ending.name.lower().replace('_', ' ')}, "
+            f"objective {self.objective:.8g}, {t.time[0]:g} to {t.time[-1]:g} s, "
+            f"{self.grid.intervals} intervals, {self.iterations} iterations>"
+        )
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The first scenario's trajectory."""
+        return self.trajectories[0]
+
+    @property
+    def solved(self) -> bool:
+        """Whether the result satisfies the optimality conditions on its mesh."""
+        return self.ending.solved
+
+    @property
+    def message(self) -> str:
+        """One sentence on the outcome."""
+        return f"{self.reason}; {self.ending.value}" if self.reason else self.ending.value
+
+    def at(self, tau: Array, scenario: int = 0) -> tuple[Array, Array]:
+        """States and controls between the nodes, by the scheme's polynomials.
+
+        Parameters
+        ----------
+        tau
+            Normalised times from 0 to 1, shape ``(time,)``.
+        scenario
+            Which one.
+
+        Returns
+        -------
+        tuple of ndarray
+            Shapes ``(time, state)`` and ``(time, control)``.
+        """
+        run = self.trajectories[scenario]
+        X, U = (
+            run.select(c.name for c in run.channels if c.role == role).values
+            for role in ("state", "control")
+        )
+        return self.grid.states(X, tau), self.grid.controls(U, tau)
+
+    def summary(self) -> str:
+        """Describe the outcome in a few lines."""
+        span = self.trajectory
+        lines = [
+            f"{self.name}: {self.message}",
+            f"objective {self.objective:.10g} (final cost {self.final_cost:.6g}, integral "
+            f"{self.integral_cost:.6g}), {span.time[0]:g} to {span.time[-1]:.8g} s",
+            f"{self.grid.kind}, {self.grid.intervals} intervals, local error {self.error:.2g}, "
+            f"largest violation {self.violation:.2g}",
+            f"{self.iterations} iterations, {self.seconds['compile']:.2f} s to compile, "
+            f"{self.seconds['solve']:.2f} s to solve"
+            + (", linear-quadratic" if self.linear_quadratic else ""),
+        ]
+        for mesh in self.meshes if len(self.meshes) > 1 else ():
+            lines.append(
+                f"  {mesh['intervals']} intervals: objective {mesh['objective']:.10g}, local error "
+                f"{mesh['error']:.2g}, {mesh['iterations']} iterations"
+            )
+        if self.parameters:
+            lines.append("parameters: " + _listed(self.parameters))
+        for k, replay in enumerate(self.replays):
+            where = f" of scenario {k + 1}" if len(self.replays) > 1 else ""
+            lines.append(
+                f"simulated{where}, the states differ by at most {_listed(replay.deviation)}"
+            )
+        if self.outside is not None:
+            lines.append(f"{self.outside:.1%} of the horizon outside the training range")
+        return "\n".join(lines)
+
+
+def _listed(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
