@@ -36,7 +36,10 @@ def processors() -> int:
 
 
 def default_jobs() -> int:
-    """Half the processors: a fit keeps more than one busy where XLA's threads have work."""
+    """Half the processors, so that every fit has one for XLA's threads besides its own.
+
+    On two processors shared with other work, two fits at a time took longer than one by one.
+    """
     return max(1, processors() // 2)
 
 
