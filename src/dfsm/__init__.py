@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from dfsm.compare import RankedCandidate, Ranking, compare
     from dfsm.config import load_config
     from dfsm.control import (
         DirectTranscription,
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from dfsm.steady import SteadyState, steady_state
     from dfsm.storage import load, load_all, save
     from dfsm.trajectory import Channel, Dataset, Trajectory
+    from dfsm.trial import Candidate, Outcome
     from dfsm.validate import Validation, compared, validate
 
 # Where each public name lives, in the order of the data flow.
@@ -114,6 +116,11 @@ _HOME = {
     "Validation": "validate",
     "compared": "validate",
     "validate": "validate",
+    "Candidate": "trial",
+    "Outcome": "trial",
+    "RankedCandidate": "compare",
+    "Ranking": "compare",
+    "compare": "compare",
     "calibrate": "intervals",
     "Intervals": "intervals",
     "OptimalControlProblem": "control",

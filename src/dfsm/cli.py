@@ -111,6 +111,42 @@ def fit(
 
 
 @app.command()
+def compare(
+    config: Annotated[Path, typer.Argument(help="Configuration with a key 'compare'.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for models and results.")],
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Fits at a time; default half the processors.")
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit several structures and rank them on runs held out; goes on where it was ended."""
+    from dfsm.compare import check_output
+    from dfsm.compare import compare as run_compare
+    from dfsm.config import parse_candidates
+    from dfsm.console import print_ranking
+    from dfsm.read import read_all
+
+    settings, candidates = parse_candidates(config)
+    check_output(output, candidates)
+    files, hold_out = settings.compare.validation, settings.compare.hold_out
+    with _working(quiet):
+        runs = read_all(settings.data.train, config.parent)
+        validation = None if files is None else read_all(files, config.parent)
+        found = run_compare(
+            candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
+        )
+    if found.best is None:
+        raise DfsmError("; ".join(found.failures()))
+    if as_json:
+        _print_json(found.to_dict())
+    elif not quiet:
+        print_ranking(found)
+    if found.best.score is None:
+        raise typer.Exit(1)
+
+
+@app.command()
 def summary(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
 ) -> None:

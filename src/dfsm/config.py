@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from dfsm.compare import HOLD_OUT, check_candidates
 from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
 from dfsm.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.errors import DfsmError, near_matches
@@ -17,8 +20,14 @@ from dfsm.linear import LPV, LTI
 from dfsm.read import read_all
 from dfsm.refine import RefineSettings
 from dfsm.samples import FitSettings
+from dfsm.settings import require
 from dfsm.signals import Azimuth
 from dfsm.trajectory import Trajectory
+from dfsm.trial import Candidate
+
+# Name of the configuration itself among the candidates of `compare`.
+BASE = "base"
+_CANDIDATES = "compare.candidates"
 
 
 class _Strict(BaseModel):
@@ -55,6 +64,33 @@ class SignalConfig(_Strict):
     outputs: list[str] = []
 
 
+class CompareConfig(_Strict):
+    """What `dfsm compare` compares; `dfsm fit` does not look at it.
+
+    Attributes
+    ----------
+    candidates
+        By name the keys that each of them changes; the configuration itself is called base.
+    hold_out
+        Share of the training runs that rank the candidates.
+    validation
+        Files that rank them instead; those among the training files are not trained with.
+    """
+
+    candidates: dict[str, dict[str, Any]] = {}
+    hold_out: float = HOLD_OUT
+    validation: list[str] | None = None
+
+    def model_post_init(self, _: Any, /) -> None:
+        """Check what types cannot."""
+        share = "a share between 0 and 1"
+        require(0 < self.hold_out < 1, "compare.hold_out", self.hold_out, share)
+        both = self.validation is not None and "hold_out" in self.model_fields_set
+        require(not both, "compare.hold_out", self.hold_out, "no value beside compare.validation")
+        files = self.validation is None or bool(self.validation)
+        require(files, "compare.validation", "empty", "file names or patterns, or null")
+
+
 class Config(_Strict):
     """A whole `config.yaml`."""
 
@@ -70,6 +106,7 @@ class Config(_Strict):
     nonlinear_only: bool = FitSettings.nonlinear_only
     refine: RefineSettings | None = None
     seed: int = FitSettings.seed
+    compare: CompareConfig = CompareConfig()
 
     def fit_settings(self) -> FitSettings:
         """The settings of `fit`."""
@@ -105,18 +142,117 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
     """
     path = Path(path)
     config = parse_config(path)
-    if not config.data.train:
-        raise DfsmError(f"{path}: 'data.train' names no files: list the runs to train with")
+    _require_files(config, path)
     try:
-        # What only shows with all keys together must not wait until the data have been read.
-        _ = state_names(config.signals.states), config.fit_settings().roles
+        _check_together(config)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
     return config, read_all(config.data.train, path.parent)
 
 
+def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:
+    """Read a configuration and the candidates that it declares, without touching the data.
+
+    Returns
+    -------
+    tuple
+        The configuration, and the candidates by name: itself first, as ``base``.
+
+    Raises
+    ------
+    DfsmError
+        As `load_config`; also without candidates, or where one has an unknown key or value.
+    """
+    path = Path(path)
+    config = parse_config(path)
+    _require_files(config, path)
+    if not config.compare.candidates:
+        raise DfsmError(
+            f"{path}: '{_CANDIDATES}' is missing: name what to try there, for instance "
+            "compare: {candidates: {gp: {corrective: {kind: gp}}}}"
+        )
+    raw = _load_yaml(path)
+    try:
+        _check_together(config)
+        found = {BASE: Candidate(config.fit_settings(), config.refine, f"{path.name} as it stands")}
+        for name, changes in config.compare.candidates.items():
+            found[name] = _candidate(raw, name, changes)
+        check_candidates(found)
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
+    return config, found
+
+
+def _candidate(raw: Mapping[str, Any], name: str, changes: Mapping[str, Any]) -> Candidate:
+    where = f"{_CANDIDATES}.{name}"
+    if name == BASE:
+        raise DfsmError(f"'{where}' is the configuration itself: choose another name")
+    for key in ("data", "compare"):
+        if key in changes:
+            raise DfsmError(
+                f"'{where}.{key}' cannot be changed, candidates are compared on the same runs: "
+                f"change '{key}' for all of them"
+            )
+    merged = _merged(raw, changes)
+    try:
+        config = Config.model_validate(merged)
+        _check_together(config)
+    except ValidationError as error:
+        raise DfsmError(_explain(error, merged, f"{where}.")) from None
+    except DfsmError as error:
+        raise DfsmError(f"{where}: {error}") from None
+    told = (f"{k} = {v}" for k, v in _changed(changes))
+    return Candidate(config.fit_settings(), config.refine, "; ".join(told))
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with some keys changed; what is of another kind has other keys and is replaced."""
+    merged = dict(base)
+    for key, value in changes.items():
+        old = base.get(key)
+        merged[key] = value
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            kind = old.get("kind")
+            if value.get("kind", kind) == kind:
+                merged[key] = _merged(old, value)
+    return merged
+
+
+def _changed(changes: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Path and value of every key that a candidate gives."""
+    found = []
+    for key, value in changes.items():
+        if isinstance(value, Mapping) and value:
+            found += _changed(value, f"{prefix}{key}.")
+        else:
+            text = value if isinstance(value, str) else None
+            shown = text or json.dumps(value, ensure_ascii=False, default=str)
+            found.append((f"{prefix}{key}", shown))
+    return found
+
+
+def _require_files(config: Config, path: Path) -> None:
+    if not config.data.train:
+        raise DfsmError(f"{path}: 'data.train' names no files: list the runs to train with")
+
+
+def _check_together(config: Config) -> None:
+    """What only shows with all keys together must not wait until the data have been read."""
+    _ = state_names(config.signals.states), config.fit_settings().roles
+
+
 def parse_config(path: Path) -> Config:
     """Read and check a configuration without touching the data."""
+    raw = _load_yaml(path)
+    try:
+        return Config.model_validate(raw)
+    except ValidationError as error:
+        raise DfsmError(f"{path}: {_explain(error, raw)}") from None
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
+
+
+def _load_yaml(path: Path) -> dict[str, Any]:
     if path.is_dir():
         inside = [*path.glob("config.yaml")] or [*path.glob("*.yaml"), *path.glob("*.yml")]
         hint = f"did you mean {inside[0]}?" if len(inside) == 1 else "name one, or use dfsm init"
@@ -136,15 +272,10 @@ def parse_config(path: Path) -> Config:
         raise DfsmError(f"{path} is nested too deeply for a configuration") from None
     if not isinstance(raw, dict):
         raise DfsmError(f"{path} holds no keys; make a configuration with dfsm init")
-    try:
-        return Config.model_validate(raw)
-    except ValidationError as error:
-        raise DfsmError(f"{path}: {_explain(error, raw)}") from None
-    except DfsmError as error:
-        raise DfsmError(f"{path}: {error}") from None
+    return raw
 
 
-def _explain(error: ValidationError, raw: dict[str, Any]) -> str:
+def _explain(error: ValidationError, raw: dict[str, Any], prefix: str = "") -> str:
     """The first thing wrong, with the path of its key as it stands in the file."""
     first = error.errors()[0]
     if first["type"] == "value_error":
@@ -152,6 +283,7 @@ def _explain(error: ValidationError, raw: dict[str, Any]) -> str:
         return str(first.get("ctx", {}).get("error", first["msg"]))
     keys = _path(first["loc"], raw)
     where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
+    where = prefix + where
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _known_keys(keys[:-1], raw)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"

@@ -12,6 +12,7 @@ from rich.text import Text
 from dfsm.errors import printable
 
 if TYPE_CHECKING:
+    from dfsm.compare import Ranking
     from dfsm.read.info import RunInfo
     from dfsm.report.article import Article
     from dfsm.validate import Validation
@@ -100,6 +101,36 @@ def print_validations(found: Mapping[str, Validation]) -> None:
             console.print(_text(f"{prefix}{text}"))
 
 
+def print_ranking(found: Ranking) -> None:
+    """Print candidates best first, what each changes, and how to use the best."""
+    console = _console()
+    table = _table("candidate", "score", *map(printable, found.states), "rollouts done")
+    for column in ("parameters", "fit", "simulate"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("changes", justify="left", overflow="fold")
+    of = len(found.validation)
+    for c in found.candidates:
+        o = c.outcome
+        figures = [_figure(c.score, ".3f"), *(_figure(o.nrmse.get(n), ".3f") for n in found.states)]
+        costs = [f"{of - o.diverged} of {of}", str(o.parameters)]
+        costs += [f"{o.fit_seconds:.1f} s", f"{1000 * o.simulate_seconds:.0f} ms"]
+        costs = ["–"] * len(costs) if c.status == "failed" else costs
+        table.add_row(_text(c.name), *figures, *costs, _text(c.changes))
+    console.print(table)
+    states = ", ".join(found.states)
+    console.print(_text(f"score: root mean square over {states} of the NRMSE of rollouts"))
+    for text in found.failures():
+        console.print(_text(text))
+    kept = [c.name for c in found.candidates if c.kept]
+    if kept:
+        console.print(_text(f"not fitted again, nothing has changed: {', '.join(kept)}"))
+    console.print(_text(f"trained on: {', '.join(found.training)}"))
+    console.print(_text(f"chosen on: {', '.join(found.validation)} (test the choice on others)"))
+    if found.best is not None:
+        use = f"its model is {found.best.folder}: dfsm validate it on other runs"
+        console.print(_text(f"best: {found.best.name}, {use}"))
+
+
 def print_article(article: Article) -> None:
     """Print the tables of a study; texts and figures are in its page."""
     console = _console()
@@ -131,7 +162,7 @@ def _figure(value: float | None, form: str) -> str:
 def _table(*columns: str) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
-        text = column in ("model", "channel", "unit", "variant")
+        text = column in ("model", "channel", "unit", "variant", "candidate")
         table.add_column(column, justify="left" if text else "right", no_wrap=True)
     return table
 

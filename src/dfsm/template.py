@@ -67,6 +67,15 @@ nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in
 # refine: {{windows: [20, 100, null], step: 0.25}}
 refine: null
 seed: 0
+
+# Structures to try: dfsm compare {name} -o comparison/ ranks them, and the one above, on a share of
+# the training runs. Each names the keys that it changes.
+# compare:
+#   hold_out: 0.2       # or validation: [files], which rank instead
+#   candidates:
+#     gp: {{corrective: {{kind: gp}}}}
+#     linear: {{corrective: {{kind: none}}}}
+#     refined: {{refine: {{windows: [20, 100, null], latents: 2}}}}
 """
 
 
