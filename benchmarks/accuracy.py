@@ -20,8 +20,8 @@ def demo() -> ModuleType:
     return module
 
 
-def run() -> dict[str, Any]:
-    """Fit and validate as the demo does.
+def run(*labels: str) -> dict[str, Any]:
+    """Fit and validate as the demo does, all its models or those named.
 
     Returns
     -------
@@ -40,5 +40,5 @@ def run() -> dict[str, Any]:
             }
             for variant in validation.models
         }
-        for label, (_, validation) in demo().study().items()
+        for label, (_, validation) in demo().study(labels or demo().WINDS).items()
     }

@@ -63,8 +63,9 @@ corrective:
 gate: 0.01            # correct a row only if its residual exceeds this share of the signal
 azimuth: {azimuth}
 nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in the report
-# Refine the derivative fit on rollouts over the training runs, for instance
-# refine: {{windows: [20, 100, null], step: 0.25}}
+# Refine the derivative fit on rollouts over the training runs (null is a whole run), with latent
+# states that remember the inputs, for instance
+# refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8}}
 refine: null
 seed: 0
 
