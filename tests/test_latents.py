@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from dfsm.corrective import GaussianUnits, NoCorrection, Perceptron
+from dfsm.corrective import RBF, GaussianUnits, NoCorrection, Perceptron
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError
 from dfsm.fit import fit
@@ -21,9 +21,9 @@ from dfsm.refine import RefineSettings
 from dfsm.rollout_error import RolloutError, record_of
 from dfsm.samples import FitSettings
 from dfsm.simulate import Status, initial_state, simulate
-from dfsm.storage import load, save
+from dfsm.storage import load, load_all, save
 from dfsm.trajectory import Channel, Trajectory
-from dfsm.validate import validate
+from dfsm.validate import compared, validate
 from systems import wander
 
 TIME = np.arange(0, 60.01, 0.1)
@@ -205,6 +205,17 @@ def test_sensitivities_agree_with_differences(model, runs):
     for d in eps * np.eye(parameters.size):
         slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-7)
+
+
+def test_a_nonlinear_model_beside_it_has_none(runs, tmp_path):
+    choices = replace(SETTINGS, corrective=RBF(samples=20), nonlinear_only=True)
+    found = fit(runs, choices, replace(REFINEMENT, windows=(5.0,), iterations=2))
+    save(found.model, tmp_path / "m", found.nonlinear)
+    again = load_all(tmp_path / "m")
+    checked = validate(compared(*again.values()), [driven(98)], start=START)
+    assert list(checked.models) == ["linear-fit", "multi-fidelity", "nonlinear-only"]
+    assert all(checked.completed(name) for name in ("linear-fit", "multi-fidelity"))
+    assert not again["nonlinear-only"].signals.latents
 
 
 def test_an_odd_number_is_refused():

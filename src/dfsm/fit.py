@@ -105,12 +105,13 @@ def fit(
         f = _fit_derivatives(samples, choices)
     with _timed(seconds, "corrective functions"):
         e = correct(samples, samples.inputs, samples.derivatives, f, choices)
+    region = _region(samples, f.model, data)
     model = DFSM(
         f=f.model,
         e=e.function,
         g=None,
         e_g=None,
-        region=_region(samples, f.model, data),
+        region=region,
         corrected=e.rows,
         corrected_outputs=(),
         signals=samples.signals,
@@ -139,7 +140,7 @@ def fit(
     nonlinear = None
     if choices.nonlinear_only and not isinstance(choices.corrective, NoCorrection):
         with _timed(seconds, "nonlinear-only"):
-            nonlinear = _fit_nonlinear(samples, model.region, choices)
+            nonlinear = _fit_nonlinear(samples, region, choices)
     decisions = [*e.decisions, *(e_g.decisions if e_g else [])]
     record = dict(model.provenance.record) | _record(
         data, choices, f, decisions, notes, checks, seconds

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +118,7 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
     structure: dict[str, Any] = {
         "corrected": list(model.corrected),
         "corrected_outputs": list(model.corrected_outputs),
+        "latents": len(model.signals.latents),
     }
     keep("region", model.region, _REGION)
     for name, linear in (("f", model.f), ("g", model.g)):
@@ -177,6 +178,9 @@ def _put_together(
     f = linear("f")
     if f is None:
         raise KeyError("f")
+    if not structure.get("latents", 0):
+        # The nonlinear-only model beside a refined one has none.
+        signals = replace(signals, states=signals.observed, latents=())
     return DFSM(
         f=f,
         e=corrective("e"),
