@@ -61,7 +61,9 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "edges": solution.grid.edges,
         "solver_state": solution.solver_state,
     }
-    tensors |= {f"multipliers/{n}": np.asarray(v) for n, v in solution.multipliers.items()}
+    for group in ("multipliers", "bounds"):
+        found = getattr(solution, group)
+        tensors |= {f"{group}/{n}": np.asarray(v) for n, v in found.items()}
     manifest: dict[str, Any] = {"format": FORMAT, "dfsm": dfsm.__version__}
     manifest |= {key: getattr(solution, key) for key in _PLAIN}
     manifest |= {
@@ -103,16 +105,14 @@ def load_solution(path: str | Path) -> Solution:
                 _together("replays", manifest, tensors), manifest["deviations"], strict=True
             )
         ]
-        prefix = "multipliers/"
         return Solution(
             **plain,
             ending=Ending[manifest["ending"]],
             grid=Grid(**manifest["scheme"], edges=tensors["edges"]),
             trajectories=tuple(_together("trajectories", manifest, tensors)),
             costates=tuple(_together("costates", manifest, tensors)),
-            multipliers={
-                k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)
-            },
+            multipliers=_group("multipliers/", tensors),
+            bounds=_group("bounds/", tensors),
             replays=tuple(replays),
             solver_state=tensors["solver_state"],
         )
@@ -142,6 +142,10 @@ def _together(
         )
         for k, told in enumerate(manifest[group])
     ]
+
+
+def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
 def _is_solution(path: Path) -> bool:

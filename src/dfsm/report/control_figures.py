@@ -1,0 +1,95 @@
+"""Figures of optimal trajectories: signals above each other on one time axis, with their bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dfsm.control.solution import Solution
+from dfsm.report.article import Curve, Figure, Panel
+from dfsm.types import Array
+
+_TIME = "time (s)"
+# Bounds further away than this share of a signal's range would flatten it: they are not drawn.
+_FAR = 1.5
+
+
+def stacked_figure(
+    key: str,
+    caption: str,
+    solutions: Mapping[str, Solution],
+    names: Sequence[str],
+    derived: Mapping[str, Mapping[str, Array]] | None = None,
+    scenario: int = 0,
+) -> Figure:
+    """Draw the same signals of several solutions.
+
+    Parameters
+    ----------
+    key, caption
+        See `Figure`.
+    solutions
+        By the name of their curves; each has its colour.
+    names
+        Channels, one panel each; those that are the same in all solutions are drawn once.
+    derived
+        Signals that are no channels, by title with unit and by solution: shape ``(time,)``.
+    scenario
+        Of the solutions.
+    """
+    first = next(iter(solutions.values())).trajectories[scenario]
+    panels = []
+    for name in names:
+        courses = {k: s.trajectories[scenario][name] for k, s in solutions.items()}
+        bounds = {k: s.bounds[name] for k, s in solutions.items() if name in s.bounds}
+        times = {k: s.trajectories[scenario].time for k, s in solutions.items()}
+        panels.append(_panel(name, first.channel(name).unit, times, courses, bounds))
+    for title, courses in (derived or {}).items():
+        times = {k: s.trajectories[scenario].time for k, s in solutions.items()}
+        panels.append(_panel(title, "", times, courses, {}))
+    return Figure(key, caption, tuple(panels), stacked=True)
+
+
+def _panel(
+    name: str,
+    unit: str,
+    times: Mapping[str, Array],
+    courses: Mapping[str, Array],
+    bounds: Mapping[str, Array],
+) -> Panel:
+    same = _all_same([*courses.values()])
+    shown = dict([next(iter(courses.items()))]) if same and len(courses) > 1 else courses
+    curves = [
+        Curve("the same for all" if shown is not courses else label, times[label], values, colour)
+        for (label, values), colour in zip(
+            shown.items(), [0] if shown is not courses else range(1, len(courses) + 1), strict=True
+        )
+    ]
+    least = min(float(v.min()) for v in courses.values())
+    most = max(float(v.max()) for v in courses.values())
+    reach = _FAR * ((most - least) or max(abs(most), 1.0))
+    drawn: list[Array] = []
+    for colour, (label, pair) in enumerate(bounds.items(), start=1):
+        for limit in pair:
+            # A bound that all share is drawn once, in the colour of none.
+            shared = all(_all_same([limit, *other]) for other in _near(limit, bounds))
+            known = any(len(d) == len(limit) and np.allclose(d, limit) for d in drawn)
+            finite = np.isfinite(limit).all()
+            if known or not finite or limit.max() > most + reach or limit.min() < least - reach:
+                continue
+            drawn.append(limit)
+            paint = 0 if shared else colour
+            # In the colour of its solution it needs no entry of its own in the legend.
+            title = "bounds" if shared else label
+            curves.append(Curve(title, times[label], limit, paint, "dashed"))
+    return Panel(f"{name} ({unit})" if unit else name, _TIME, "", tuple(curves))
+
+
+def _near(limit: Array, bounds: Mapping[str, Array]) -> list[list[Array]]:
+    """Of every solution the limit that is nearest to one."""
+    return [[min(pair, key=lambda p: float(np.abs(p - limit).max()))] for pair in bounds.values()]
+
+
+def _all_same(values: Sequence[Array]) -> bool:
+    return all(len(v) == len(values[0]) and np.allclose(v, values[0]) for v in values[1:])
