@@ -18,12 +18,14 @@ import dfsm
 from dfsm.control.grid import Grid
 from dfsm.control.solution import Ending, Replay, Solution
 from dfsm.errors import DfsmError
-from dfsm.files import json_bytes, write_folder
+from dfsm.files import check_folder, json_bytes, write_folder
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.types import Array
 
 FORMAT = 1
 MANIFEST, TENSORS = "manifest.json", "solution.safetensors"
+# A page about the solution, which `dfsm optimize` puts beside them.
+PAGE = "solution.html"
 # What the manifest holds as it is.
 _PLAIN = (
     "name",
@@ -78,6 +80,11 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, folder / TENSORS)
         manifest["sha256"] = hashlib.sha256((folder / TENSORS).read_bytes()).hexdigest()
         (folder / MANIFEST).write_bytes(json_bytes(manifest))
+
+
+def check_solution_target(path: str | Path) -> None:
+    """Fail where `save_solution` would refuse: call it before long work, not after."""
+    check_folder(path, is_ours=_is_solution)
 
 
 def load_solution(path: str | Path) -> Solution:
@@ -149,7 +156,7 @@ def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _is_solution(path: Path) -> bool:
-    return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
+    return {p.name for p in path.iterdir()} - {PAGE} == {MANIFEST, TENSORS}
 
 
 def _damaged(path: Path, what: str) -> DfsmError:

@@ -73,7 +73,7 @@ def _panel(
     for colour, (label, pair) in enumerate(bounds.items(), start=1):
         for limit in pair:
             # A bound that all share is drawn once, in the colour of none.
-            shared = all(_all_same([limit, *other]) for other in _near(limit, bounds))
+            shared = all(any(_all_same([limit, p]) for p in other) for other in bounds.values())
             known = any(len(d) == len(limit) and np.allclose(d, limit) for d in drawn)
             finite = np.isfinite(limit).all()
             if known or not finite or limit.max() > most + reach or limit.min() < least - reach:
@@ -84,11 +84,6 @@ def _panel(
             title = "bounds" if shared else label
             curves.append(Curve(title, times[label], limit, paint, "dashed"))
     return Panel(f"{name} ({unit})" if unit else name, _TIME, "", tuple(curves))
-
-
-def _near(limit: Array, bounds: Mapping[str, Array]) -> list[list[Array]]:
-    """Of every solution the limit that is nearest to one."""
-    return [[min(pair, key=lambda p: float(np.abs(p - limit).max()))] for pair in bounds.values()]
 
 
 def _all_same(values: Sequence[Array]) -> bool:
