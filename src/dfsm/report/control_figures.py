@@ -32,22 +32,24 @@ def stacked_figure(
     solutions
         By the name of their curves; each has its colour.
     names
-        Channels, one panel each; those that are the same in all solutions are drawn once.
+        Channels and keys of `derived`, one panel each; what is the same in all solutions is drawn
+        once.
     derived
         Signals that are no channels, by title with unit and by solution: shape ``(time,)``.
     scenario
         Of the solutions.
     """
-    first = next(iter(solutions.values())).trajectories[scenario]
+    runs = {label: s.trajectories[scenario] for label, s in solutions.items()}
+    first = next(iter(runs.values()))
+    times = {label: run.time for label, run in runs.items()}
     panels = []
     for name in names:
-        courses = {k: s.trajectories[scenario][name] for k, s in solutions.items()}
+        if derived and name in derived:
+            panels.append(_panel(name, "", times, derived[name], {}))
+            continue
+        courses = {label: run[name] for label, run in runs.items()}
         bounds = {k: s.bounds[name] for k, s in solutions.items() if name in s.bounds}
-        times = {k: s.trajectories[scenario].time for k, s in solutions.items()}
         panels.append(_panel(name, first.channel(name).unit, times, courses, bounds))
-    for title, courses in (derived or {}).items():
-        times = {k: s.trajectories[scenario].time for k, s in solutions.items()}
-        panels.append(_panel(title, "", times, courses, {}))
     return Figure(key, caption, tuple(panels), stacked=True)
 
 
@@ -58,14 +60,14 @@ def _panel(
     courses: Mapping[str, Array],
     bounds: Mapping[str, Array],
 ) -> Panel:
-    same = _all_same([*courses.values()])
-    shown = dict([next(iter(courses.items()))]) if same and len(courses) > 1 else courses
-    curves = [
-        Curve("the same for all" if shown is not courses else label, times[label], values, colour)
-        for (label, values), colour in zip(
-            shown.items(), [0] if shown is not courses else range(1, len(courses) + 1), strict=True
-        )
-    ]
+    if len(courses) > 1 and _all_same([*courses.values()]):
+        label, values = next(iter(courses.items()))
+        curves = [Curve("the same for all", times[label], values, 0)]
+    else:
+        curves = [
+            Curve(label, times[label], values, colour)
+            for colour, (label, values) in enumerate(courses.items(), start=1)
+        ]
     least = min(float(v.min()) for v in courses.values())
     most = max(float(v.max()) for v in courses.values())
     reach = _FAR * ((most - least) or max(abs(most), 1.0))

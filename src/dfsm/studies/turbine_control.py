@@ -252,11 +252,14 @@ class ControlStudy:
         How much was computed.
     seconds
         Wall time.
+    gains
+        By region, see `steady_gains`.
     """
 
     results: tuple[Result, ...]
     size: ControlStudySize
     seconds: float
+    gains: Mapping[str, tuple[float, float]]
 
     def series(self) -> dict[tuple[str, str], dict[float, Result]]:
         """Results that differ in Θ_p,max only, by wind series and variant."""
@@ -380,4 +383,31 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
             for case, inside in variants:
                 for most_pitch in size.pitch_limits:
                     results.append(optimise(region, wind, case, most_pitch, size, inside))
-    return ControlStudy(tuple(results), size, clock.perf_counter() - begin)
+    gains = {region.name: steady_gains(region.model) for region in regions}
+    return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
+
+
+def steady_gains(model: DFSM) -> tuple[float, float]:
+    """How the rotor speed of a model settles when torque or blade pitch rise for good.
+
+    Both gains are negative for a turbine: either brakes the rotor. Closed-loop data can teach a
+    model the reverse, because the controller raises both when the rotor is fast.
+
+    Parameters
+    ----------
+    model
+        Linearised at the mean of its training data.
+
+    Returns
+    -------
+    tuple of float
+        In rpm per MN m and in rpm per deg.
+    """
+    s, centre = model.signals, np.asarray(model.region.mean)
+    count = len(s.controls), len(s.disturbances), len(s.states)
+    u, w, x, p = np.split(centre, np.cumsum(count))
+    A, B, _, _ = model.jacobians(x, u, w, p)
+    gain = -np.linalg.solve(A, B)
+    row = gain[[c.name for c in s.states].index(SPEED)]
+    names = [c.name for c in s.controls]
+    return float(row[names.index(TORQUE)] * 1e3), float(row[names.index(BLADE)])
