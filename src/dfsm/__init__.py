@@ -44,7 +44,7 @@ if TYPE_CHECKING:
         write_table,
     )
     from dfsm.refine import RefineResult, RefineSettings, refine
-    from dfsm.report import write_report
+    from dfsm.report import write_report, write_solution_report
     from dfsm.samples import FitSettings
     from dfsm.signals import Azimuth
     from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
@@ -132,6 +132,7 @@ _HOME = {
     "save_solution": "control",
     "load_solution": "control",
     "write_report": "report",
+    "write_solution_report": "report",
     "load_config": "config",
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
@@ -28,13 +28,18 @@ from dfsm.trial import Candidate
 # Name of the configuration itself among the candidates of `compare`.
 BASE = "base"
 _CANDIDATES = "compare.candidates"
+_ADVICE = "make one with dfsm init"
+
+Parsed = TypeVar("Parsed", bound=BaseModel)
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """Frozen, and unknown keys are refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class DataConfig(_Strict):
+class DataConfig(Strict):
     """Training files and the part of them that is used.
 
     Attributes
@@ -53,7 +58,7 @@ class DataConfig(_Strict):
     hub_height: float | None = None
 
 
-class SignalConfig(_Strict):
+class SignalConfig(Strict):
     """Channel names by role, see `FitSettings`."""
 
     states: list[StateSpec]
@@ -64,7 +69,7 @@ class SignalConfig(_Strict):
     outputs: list[str] = []
 
 
-class CompareConfig(_Strict):
+class CompareConfig(Strict):
     """What `dfsm compare` compares; `dfsm fit` does not look at it.
 
     Attributes
@@ -91,7 +96,7 @@ class CompareConfig(_Strict):
         require(files, "compare.validation", "empty", "file names or patterns, or null")
 
 
-class Config(_Strict):
+class Config(Strict):
     """A whole `config.yaml`."""
 
     data: DataConfig
@@ -171,7 +176,7 @@ def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:
             f"{path}: '{_CANDIDATES}' is missing: name what to try there, for instance "
             "compare: {candidates: {gp: {corrective: {kind: gp}}}}"
         )
-    raw = _load_yaml(path)
+    raw = _load_yaml(path, _ADVICE)
     try:
         _check_together(config)
         found = {BASE: Candidate(config.fit_settings(), config.refine, f"{path.name} as it stands")}
@@ -198,7 +203,7 @@ def _candidate(raw: Mapping[str, Any], name: str, changes: Mapping[str, Any]) ->
         config = Config.model_validate(merged)
         _check_together(config)
     except ValidationError as error:
-        raise DfsmError(_explain(error, merged, f"{where}.")) from None
+        raise DfsmError(_explain(error, merged, Config, f"{where}.")) from None
     except DfsmError as error:
         raise DfsmError(f"{where}: {error}") from None
     told = (f"{k} = {v}" for k, v in _changed(changes))
@@ -243,26 +248,44 @@ def _check_together(config: Config) -> None:
 
 def parse_config(path: Path) -> Config:
     """Read and check a configuration without touching the data."""
-    raw = _load_yaml(path)
+    return parse_file(path, Config, _ADVICE)
+
+
+def parse_file(path: Path, kind: type[Parsed], advice: str) -> Parsed:
+    """Read a YAML file as a pydantic model; whatever is wrong with it is one sentence.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    kind
+        Model that says which keys there are.
+    advice
+        What to do without such a file.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing or not YAML, or a key is unknown, missing or wrong.
+    """
+    raw = _load_yaml(path, advice)
     try:
-        return Config.model_validate(raw)
+        return kind.model_validate(raw)
     except ValidationError as error:
-        raise DfsmError(f"{path}: {_explain(error, raw)}") from None
+        raise DfsmError(f"{path}: {_explain(error, raw, kind)}") from None
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
 
 
-def _load_yaml(path: Path) -> dict[str, Any]:
+def _load_yaml(path: Path, advice: str) -> dict[str, Any]:
     if path.is_dir():
         inside = [*path.glob("config.yaml")] or [*path.glob("*.yaml"), *path.glob("*.yml")]
-        hint = f"did you mean {inside[0]}?" if len(inside) == 1 else "name one, or use dfsm init"
+        hint = f"did you mean {inside[0]}?" if len(inside) == 1 else f"name one, or {advice}"
         raise DfsmError(f"{path} is a folder, a configuration file was expected: {hint}")
     try:
         raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise DfsmError(
-            f"{path} cannot be read ({error.strerror}): make one with dfsm init"
-        ) from None
+        raise DfsmError(f"{path} cannot be read ({error.strerror}): {advice}") from None
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
         raise DfsmError(f"{path}, line {line}: not valid YAML ({error.problem})") from None
@@ -271,11 +294,13 @@ def _load_yaml(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise DfsmError(f"{path} is nested too deeply for a configuration") from None
     if not isinstance(raw, dict):
-        raise DfsmError(f"{path} holds no keys; make a configuration with dfsm init")
+        raise DfsmError(f"{path} holds no keys; {advice}")
     return raw
 
 
-def _explain(error: ValidationError, raw: dict[str, Any], prefix: str = "") -> str:
+def _explain(
+    error: ValidationError, raw: dict[str, Any], kind: type[BaseModel], prefix: str = ""
+) -> str:
     """The first thing wrong, with the path of its key as it stands in the file."""
     first = error.errors()[0]
     if first["type"] == "value_error":
@@ -285,16 +310,16 @@ def _explain(error: ValidationError, raw: dict[str, Any], prefix: str = "") -> s
     where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
     where = prefix + where
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _known_keys(keys[:-1], raw)
+        known = _known_keys(keys[:-1], raw, kind)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
     if first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument"):
         return f"key '{where}' is missing"
     if first["type"].startswith("union_tag"):
-        kinds = ", ".join(f"'{kind}'" for kind in _kinds(keys))
+        kinds = ", ".join(f"'{k}'" for k in _kinds(keys, kind))
         given = first["input"].get("kind") if isinstance(first["input"], dict) else None
         if given is None:
             return f"'{where}' needs a key 'kind', one of {kinds}"
-        hint = near_matches(str(given), _kinds(keys))
+        hint = near_matches(str(given), _kinds(keys, kind))
         return f"'{where}.kind' is '{given}', expected one of {kinds}; {hint}"
     found = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
     message = _MESSAGES.get(first["type"], first["msg"])
@@ -328,26 +353,26 @@ def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
     return keys
 
 
-def _known_keys(keys: list[int | str], raw: Any) -> list[str]:
+def _known_keys(keys: list[int | str], raw: Any, kind: type[BaseModel]) -> list[str]:
     """Keys that may stand at a path, from the JSON schema of the configuration."""
-    nodes = _schemas(keys)
+    nodes = _schemas(keys, kind)
     for key in keys:
         raw = raw[key]
     kinds = [n for n in nodes if _kind(n) == raw.get("kind")]
     return list(dict.fromkeys(k for node in kinds or nodes for k in node.get("properties", {})))
 
 
-def _kinds(keys: list[int | str]) -> list[str]:
+def _kinds(keys: list[int | str], kind: type[BaseModel]) -> list[str]:
     """Values that the key 'kind' may have at a path."""
-    return [kind for node in _schemas(keys) if (kind := _kind(node))]
+    return [found for node in _schemas(keys, kind) if (found := _kind(node))]
 
 
 def _kind(node: dict[str, Any]) -> str | None:
     return node.get("properties", {}).get("kind", {}).get("const")
 
 
-def _schemas(keys: list[int | str]) -> list[dict[str, Any]]:
-    schema = Config.model_json_schema()
+def _schemas(keys: list[int | str], kind: type[BaseModel]) -> list[dict[str, Any]]:
+    schema = kind.model_json_schema()
     nodes = [schema]
     for key in keys:
         nodes = [child for node in nodes for child in _children(schema, node, key)]

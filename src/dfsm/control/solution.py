@@ -114,6 +114,9 @@ class Solution:
         Share of the horizon with any input outside the training range; None without a surrogate.
     replays
         Per scenario, see `Replay`; empty where it was not asked for.
+    bounds
+        By name of the states, controls and outputs that have any: lower and upper bounds at the
+        nodes, shape ``(2, time)``, infinite where there is none.
     solver_state
         Scaled multipliers, to start the same mesh warm.
     """
@@ -137,6 +140,7 @@ class Solution:
     violation: float
     outside: float | None
     replays: tuple[Replay, ...] = ()
+    bounds: Mapping[str, Array] = field(default_factory=dict)
     solver_state: Array = field(default_factory=lambda: np.empty(0))
 
     def __repr__(self) -> str:

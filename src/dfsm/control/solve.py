@@ -244,6 +244,7 @@ def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -
         violation=worst_violation(program, z),
         outside=_outside(problem, trajectories),
         replays=replays,
+        bounds=_bounds(shot, trajectories[0].time),
         solver_state=outcome.multipliers,
     )
 
@@ -289,6 +290,18 @@ def _multipliers(program: Program, outcome: Outcome) -> dict[str, Array]:
         if not rows.name.startswith("dynamics of "):
             values = outcome.multipliers[rows.index] / program.row_scale[rows.index]
             found[rows.name] = np.append(found.get(rows.name, np.empty(0)), values)
+    return found
+
+
+def _bounds(shot: Shot, time: Array) -> dict[str, Array]:
+    """Bounds that held, those of the training range included where it was not to be left."""
+    plant, found = shot.problem.plant, {}
+    for group in ("states", "controls", "outputs"):
+        limits = shot.problem.limits if group == "outputs" else shot.layout.channel_limits
+        for name in plant.names(group):
+            pair = np.stack(limits(name, time))
+            if np.isfinite(pair).any():
+                found[name] = pair
     return found
 
 

@@ -18,12 +18,14 @@ import dfsm
 from dfsm.control.grid import Grid
 from dfsm.control.solution import Ending, Replay, Solution
 from dfsm.errors import DfsmError
-from dfsm.files import json_bytes, write_folder
+from dfsm.files import check_folder, json_bytes, write_folder
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.types import Array
 
 FORMAT = 1
 MANIFEST, TENSORS = "manifest.json", "solution.safetensors"
+# A page about the solution, which `dfsm optimize` puts beside them.
+PAGE = "solution.html"
 # What the manifest holds as it is.
 _PLAIN = (
     "name",
@@ -61,7 +63,9 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "edges": solution.grid.edges,
         "solver_state": solution.solver_state,
     }
-    tensors |= {f"multipliers/{n}": np.asarray(v) for n, v in solution.multipliers.items()}
+    for group in ("multipliers", "bounds"):
+        found = getattr(solution, group)
+        tensors |= {f"{group}/{n}": np.asarray(v) for n, v in found.items()}
     manifest: dict[str, Any] = {"format": FORMAT, "dfsm": dfsm.__version__}
     manifest |= {key: getattr(solution, key) for key in _PLAIN}
     manifest |= {
@@ -76,6 +80,11 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, folder / TENSORS)
         manifest["sha256"] = hashlib.sha256((folder / TENSORS).read_bytes()).hexdigest()
         (folder / MANIFEST).write_bytes(json_bytes(manifest))
+
+
+def check_solution_target(path: str | Path) -> None:
+    """Fail where `save_solution` would refuse: call it before long work, not after."""
+    check_folder(path, is_ours=_is_solution)
 
 
 def load_solution(path: str | Path) -> Solution:
@@ -103,16 +112,14 @@ def load_solution(path: str | Path) -> Solution:
                 _together("replays", manifest, tensors), manifest["deviations"], strict=True
             )
         ]
-        prefix = "multipliers/"
         return Solution(
             **plain,
             ending=Ending[manifest["ending"]],
             grid=Grid(**manifest["scheme"], edges=tensors["edges"]),
             trajectories=tuple(_together("trajectories", manifest, tensors)),
             costates=tuple(_together("costates", manifest, tensors)),
-            multipliers={
-                k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)
-            },
+            multipliers=_group("multipliers/", tensors),
+            bounds=_group("bounds/", tensors),
             replays=tuple(replays),
             solver_state=tensors["solver_state"],
         )
@@ -144,8 +151,12 @@ def _together(
     ]
 
 
+def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
 def _is_solution(path: Path) -> bool:
-    return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
+    return {p.name for p in path.iterdir()} - {PAGE} == {MANIFEST, TENSORS}
 
 
 def _damaged(path: Path, what: str) -> DfsmError:

@@ -6,6 +6,8 @@
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const coarse = window.matchMedia("(pointer: coarse)");
   const HEIGHT = 235;
+  // Panels that stand above each other are lower, and only the last names their common axis.
+  const STACKED = 132;
 
   const safe = (text) =>
     String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
@@ -61,7 +63,7 @@
     };
   }
 
-  function layout(panel) {
+  function layout(panel, stacked, last) {
     const labels = (ticks) =>
       ticks.length
         ? {
@@ -75,8 +77,8 @@
       ? { range: panel.log.includes("y") ? panel.range.map(Math.log10) : panel.range }
       : {};
     return {
-      height: HEIGHT,
-      margin: { l: 44, r: 8, t: 8, b: 38 },
+      height: stacked ? STACKED + (last ? 20 : 0) : HEIGHT,
+      margin: stacked ? { l: 62, r: 8, t: 6, b: last ? 38 : 18 } : { l: 44, r: 8, t: 8, b: 38 },
       paper_bgcolor: "rgba(0,0,0,0)",
       plot_bgcolor: "rgba(0,0,0,0)",
       font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: css("--ink") },
@@ -84,9 +86,36 @@
       hovermode: panel.ticks.length ? "closest" : "x unified",
       showlegend: false,
       dragmode: coarse.matches ? false : "zoom",
-      xaxis: axis(panel.x, panel.log.includes("x"), labels(panel.x_ticks)),
-      yaxis: axis(panel.y, panel.log.includes("y"), { ...labels(panel.ticks), ...range }),
+      xaxis: axis(stacked && !last ? "" : panel.x, panel.log.includes("x"), {
+        ...labels(panel.x_ticks),
+        ...(stacked ? { automargin: false } : {}),
+      }),
+      yaxis: axis(panel.y, panel.log.includes("y"), {
+        ...labels(panel.ticks),
+        ...range,
+        // Equal margins keep stacked axes in line.
+        ...(stacked ? { automargin: false, nticks: 4 } : {}),
+      }),
     };
+  }
+
+  // Zooming one of several stacked panels zooms all.
+  function link(places) {
+    let busy = false;
+    for (const place of places) {
+      if (place.linked) continue;
+      place.linked = true;
+      place.on("plotly_relayout", (change) => {
+        if (busy || !Object.keys(change).some((key) => key.startsWith("xaxis."))) return;
+        busy = true;
+        const { range, autorange } = place.layout.xaxis;
+        const wanted = autorange ? { "xaxis.autorange": true } : { "xaxis.range": [...range] };
+        const others = [...places].filter((other) => other !== place);
+        Promise.all(others.map((other) => window.Plotly.relayout(other, wanted))).finally(() => {
+          busy = false;
+        });
+      });
+    }
   }
 
   function redraw() {
@@ -94,14 +123,18 @@
       mark.style.borderColor = colour(Number(mark.dataset.colour));
     }
     for (const [key, panels] of Object.entries(data.figures)) {
-      const places = document.getElementById(key).querySelectorAll(".plot");
-      panels.forEach((panel, i) =>
-        window.Plotly.react(places[i], panel.curves.map(trace), layout(panel), {
+      const figure = document.getElementById(key);
+      const places = figure.querySelectorAll(".plot");
+      const stacked = figure.querySelector(".stacked") !== null;
+      panels.forEach((panel, i) => {
+        const last = i === panels.length - 1;
+        window.Plotly.react(places[i], panel.curves.map(trace), layout(panel, stacked, last), {
           responsive: true,
           displayModeBar: false,
           doubleClick: "reset",
-        }),
-      );
+        });
+      });
+      if (stacked) link(places);
     }
   }
 

@@ -116,7 +116,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Panels side by side.
+    """Panels side by side, or above each other.
 
     Attributes
     ----------
@@ -126,15 +126,20 @@ class Figure:
         What it shows.
     panels
         In reading order.
+    stacked
+        Panels stand above each other and share their horizontal axis.
     """
 
     key: str
     caption: str
     panels: tuple[Panel, ...]
+    stacked: bool = False
 
     @property
     def shares_legend(self) -> bool:
         """Whether one legend serves all panels: they hold the same curves, or nearly so."""
+        if self.stacked:
+            return True
         names = [{c.name for c in p.curves} for p in self.panels]
         return all(names[0] & other for other in names)
 

@@ -79,7 +79,9 @@ def _figure(figure: Figure) -> Markup:
     return element(
         "figure",
         _legend(figure.panels) if shared else "",
-        element("div", *panels, cls=f"panels of-{len(panels)}"),
+        element(
+            "div", *panels, cls="panels " + ("stacked" if figure.stacked else f"of-{len(panels)}")
+        ),
         element("figcaption", figure.caption),
         element("noscript", "The figures need JavaScript; every number in a table does not."),
         id=figure.key,

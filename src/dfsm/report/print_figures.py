@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # Colours that colour-blind readers can tell apart (Okabe and Ito), darkened for white paper.
 _COLOURS = ("#8c959d", "#0072b2", "#d55e00", "#00916a", "#a64d8c", "#8a6d00")
 _WIDTH, _HEIGHT, _LEGEND = 7.1, 1.85, 0.32  # in: two columns of a paper, a row, the legend
+_STACKED = 1.0  # in: a row of panels that share their horizontal axis
 _MOST_COLUMNS = 4
 _STYLE: dict[Any, Any] = {
     "font.size": 7.5,
@@ -94,14 +95,19 @@ def write_figures(article: Article, folder: str | Path) -> list[Path]:
 
 def _draw(sheet: Any, figure: Figure) -> None:
     count = len(figure.panels)
-    columns = _columns(count)
+    columns = 1 if figure.stacked else _columns(count)
     rows = -(-count // columns)
-    sheet.set_size_inches(_WIDTH, rows * _HEIGHT + _LEGEND)
-    axes = sheet.subplots(rows, columns, squeeze=False).ravel()
+    height = _STACKED if figure.stacked else _HEIGHT
+    sheet.set_size_inches(_WIDTH, rows * height + _LEGEND)
+    axes = sheet.subplots(rows, columns, squeeze=False, sharex=figure.stacked).ravel()
     for place in axes[count:]:
         place.remove()
     for place, panel in zip(axes, figure.panels, strict=False):
         _panel(place, panel)
+    if figure.stacked:
+        for place in axes[: count - 1]:
+            place.set_xlabel("")
+        sheet.align_ylabels()
     if not figure.shares_legend:
         for place in axes[:count]:
             place.legend(loc="upper left", bbox_to_anchor=(-0.1, -0.3), **_SMALL_LEGEND)

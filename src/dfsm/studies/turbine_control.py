@@ -1,0 +1,413 @@
+"""The paper's optimal control study of a floating 15 MW turbine (Sec. 4), on given models and runs.
+
+    minimise ∫ ( −η τ ω + w₁ τ² + w₂ β² ) dt     τ in MN m, ω in rpm, β in deg
+
+over torque and blade pitch, with the wind known over the horizon, for several limits of the
+platform pitch, and with two sets of bounds: the paper's and those of the turbine that was
+simulated. `examples/iea15/optimal_control.py` runs it on the bundled data.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from dfsm.control import DirectTranscription, OptimalControlProblem, Solution, solve
+from dfsm.errors import DfsmError
+from dfsm.model import DFSM
+from dfsm.settings import require, settings
+from dfsm.trajectory import Trajectory
+from dfsm.types import Array
+
+# Channels of the turbine, in OpenFAST's words and units: kN m, deg, deg, rpm, m/s, kN, kN m.
+TORQUE, BLADE, PITCH, SPEED, WIND = "GenTq", "BldPitch1", "PtfmPitch", "GenSpeed", "RotWind"
+SHEAR, MOMENT = "TwrBsFxt", "TwrBsMyt"
+# Rotor radius in m, air density in kg/m³ and best power coefficient of the IEA 15 MW turbine
+# (Gaertner et al. 2020).
+RADIUS, DENSITY, BEST_COEFFICIENT = 120.0, 1.225, 0.489
+MEGAWATT = np.pi / 30e3  # of kN m × rpm
+_TORQUE_WEIGHT, _BLADE_WEIGHT = 1e-5, 0.5
+_PERCENTILE = 99.9  # of the loads in the training runs, in case (b)
+# What counts as "at the peak" of the platform pitch: this share of the horizon.
+_PEAK = 0.05
+
+Limits = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Bounds and generator efficiency.
+
+    Attributes
+    ----------
+    key, title
+        Short name, and what it is.
+    efficiency
+        η, of mechanical into electrical power.
+    lowest_pitch
+        Lower bound of the platform pitch in deg; the upper one is varied.
+    bounds
+        Of all other channels, in their units.
+    """
+
+    key: str
+    title: str
+    efficiency: float
+    lowest_pitch: float
+    bounds: Limits
+
+    @property
+    def cost(self) -> Callable[..., Any]:
+        """Integrand; the same function for the same efficiency, so that it is compiled once."""
+        return _cost(self.efficiency)
+
+
+@cache
+def _cost(efficiency: float) -> Callable[..., Any]:
+    def cost(s: Any) -> Any:
+        torque = s.u[TORQUE] / 1e3
+        power = efficiency * torque * s.x[SPEED]
+        return -power + _TORQUE_WEIGHT * torque**2 + _BLADE_WEIGHT * s.u[BLADE] ** 2
+
+    return cost
+
+
+CONTROL_BOUNDS: Limits = {TORQUE: (1670.0, 19900.0), BLADE: (0.0, 22.6)}
+PAPER = Case(
+    "a",
+    "the paper's bounds",
+    0.99,
+    0.0,
+    {**CONTROL_BOUNDS, SPEED: (1.9, 7.2), SHEAR: (0.0, 5e3), MOMENT: (0.0, 4e5)},
+)
+
+
+def turbine_case(training: Sequence[Trajectory]) -> Case:
+    """Bounds for the turbine that was simulated: rated speed, and loads as in its own runs.
+
+    Parameters
+    ----------
+    training
+        Runs that the model was fitted to, without their start-up transient.
+    """
+    loads = {
+        name: float(np.percentile(np.abs(np.concatenate([r[name] for r in training])), _PERCENTILE))
+        for name in (SHEAR, MOMENT)
+    }
+    bounds = {**CONTROL_BOUNDS, SPEED: (1.9, 7.56)} | {n: (-v, v) for n, v in loads.items()}
+    return Case("b", "bounds of this turbine", 0.9576, -1.0, bounds)
+
+
+@settings
+class ControlStudySize:
+    """How much to compute; the defaults are the paper's.
+
+    Attributes
+    ----------
+    points
+        Equidistant nodes.
+    pitch_limits
+        Upper bounds of the platform pitch in deg.
+    duration
+        Of the horizon in s.
+    tolerance
+        Of the nonlinear program.
+    inside
+        Solve case (b) also with states and controls kept inside the training range.
+    """
+
+    points: int = 1000
+    pitch_limits: tuple[float, ...] = (5.0, 6.0, 7.0)
+    duration: float = 600.0
+    tolerance: float = 1e-7
+    inside: bool = True
+
+    def __post_init__(self) -> None:
+        require(self.points >= 3, "points", self.points, "at least 3")
+        require(len(self.pitch_limits) > 0, "pitch_limits", self.pitch_limits, "one or more")
+        require(self.duration > 0, "duration", self.duration, "more than 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A range of wind speeds with its model and its runs, all without start-up transients.
+
+    Attributes
+    ----------
+    name
+        For tables, e.g. ``"12 m/s"``.
+    model
+        Fitted to `training`.
+    training, tests
+        Runs; the winds of the latter are what controls are optimised for.
+    """
+
+    name: str
+    model: DFSM
+    training: Sequence[Trajectory]
+    tests: Sequence[Trajectory]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One problem, solved or not.
+
+    Attributes
+    ----------
+    region, series
+        Names of the region and of the run whose wind it is.
+    case, most_pitch, inside
+        What bounds held: which case, Θ_p,max in deg, and whether the training range too.
+    solution
+        See `Solution`.
+    recorded
+        The run in closed loop, over the same horizon.
+    outside
+        Share of the nodes outside the training range, by input that leaves it.
+    """
+
+    region: str
+    series: str
+    case: Case
+    most_pitch: float
+    inside: bool
+    solution: Solution
+    recorded: Trajectory
+    outside: Mapping[str, float]
+
+    @property
+    def variant(self) -> str:
+        """E.g. ``"b, inside"``."""
+        return self.case.key + (", inside" if self.inside else "")
+
+    @property
+    def run(self) -> Trajectory:
+        """Optimal states, controls, disturbances and outputs."""
+        return self.solution.trajectory
+
+    @property
+    def power(self) -> float:
+        """Mean electrical power in MW."""
+        return self.case.efficiency * mean_power(self.run)
+
+    @property
+    def power_course(self) -> Array:
+        """Electrical power in MW at the nodes."""
+        return self.case.efficiency * self.run[TORQUE] * self.run[SPEED] * MEGAWATT
+
+    @property
+    def recorded_power(self) -> float:
+        """Mean electrical power in MW of the recorded run, at the same efficiency."""
+        return self.case.efficiency * mean_power(self.recorded)
+
+    @property
+    def available(self) -> float:
+        """Mean aerodynamic power in MW at the best power coefficient, of the disk's mean wind."""
+        area, wind = np.pi * RADIUS**2, self.recorded
+        return BEST_COEFFICIENT * DENSITY / 2 * area * mean(wind, wind[WIND] ** 3) / 1e6
+
+    @property
+    def blade_activity(self) -> float:
+        """RMS rate of the blade pitch in deg/s."""
+        rate = np.diff(self.run[BLADE]) / np.diff(self.run.time)
+        return float(np.sqrt(np.mean(rate**2)))
+
+    @property
+    def blade_mean(self) -> float:
+        """Mean blade pitch in deg."""
+        return mean(self.run, self.run[BLADE])
+
+    @property
+    def mean_speed(self) -> float:
+        """In rpm."""
+        return mean(self.run, self.run[SPEED])
+
+    @property
+    def peak_wind(self) -> float:
+        """Mean wind in m/s while the platform pitch is among its highest 5 %."""
+        pitch = self.run[PITCH]
+        return float(self.run[WIND][pitch >= np.quantile(pitch, 1 - _PEAK)].mean())
+
+    @property
+    def replay(self) -> float:
+        """Largest deviation of the platform pitch in deg when the controls are simulated."""
+        replays = self.solution.replays
+        return replays[0].deviation[PITCH] if replays else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class ControlStudy:
+    """What the study found.
+
+    Attributes
+    ----------
+    results
+        In the order solved.
+    size
+        How much was computed.
+    seconds
+        Wall time.
+    gains
+        By region, see `steady_gains`.
+    """
+
+    results: tuple[Result, ...]
+    size: ControlStudySize
+    seconds: float
+    gains: Mapping[str, tuple[float, float]]
+
+    def series(self) -> dict[tuple[str, str], dict[float, Result]]:
+        """Results that differ in Θ_p,max only, by wind series and variant."""
+        found: dict[tuple[str, str], dict[float, Result]] = {}
+        for r in self.results:
+            found.setdefault((r.series, r.variant), {})[r.most_pitch] = r
+        return found
+
+
+def mean(run: Trajectory, values: Array) -> float:
+    """Mean over time of values at a run's samples, by the trapezoidal rule."""
+    return float(np.trapezoid(values, run.time) / run.duration)
+
+
+def mean_power(run: Trajectory) -> float:
+    """Mean mechanical power in MW: torque times speed in rad/s."""
+    return mean(run, run[TORQUE] * run[SPEED]) * MEGAWATT
+
+
+def problem(
+    model: DFSM, wind: Trajectory, case: Case, most_pitch: float, duration: float = 600.0
+) -> OptimalControlProblem:
+    """The paper's problem for one wind series.
+
+    Parameters
+    ----------
+    model
+        With the channels of this study.
+    wind
+        Run with the disturbances; the horizon begins with its first sample.
+    case
+        Bounds and efficiency.
+    most_pitch
+        Θ_p,max in deg.
+    duration
+        Length of the horizon in s.
+
+    Raises
+    ------
+    DfsmError
+        The model lacks one of the study's channels, or the run is too short.
+    """
+    known = {
+        c.name: c for g in ("states", "controls", "outputs") for c in getattr(model.signals, g)
+    }
+    for name in (TORQUE, BLADE, PITCH, SPEED, SHEAR, MOMENT):
+        if name not in known:
+            raise DfsmError(
+                f"the model has no channel '{name}', which the turbine's problem needs: fit one "
+                f"with states {PITCH} and {SPEED}, controls {TORQUE} and {BLADE}, and outputs "
+                f"{SHEAR} and {MOMENT}"
+            )
+    start = float(wind.time[0])
+    return OptimalControlProblem(
+        model=model,
+        horizon=(start, start + duration),
+        cost=case.cost,
+        bounds={**case.bounds, PITCH: (case.lowest_pitch, most_pitch)},
+        disturbances=wind,
+        name=f"{wind.name}, case {case.key}, pitch up to {most_pitch:g} deg",
+    )
+
+
+def optimise(
+    region: Region,
+    wind: Trajectory,
+    case: Case,
+    most_pitch: float,
+    size: ControlStudySize,
+    inside: bool = False,
+) -> Result:
+    """Solve the problem for one wind series and one limit of the platform pitch.
+
+    Parameters
+    ----------
+    region
+        Gives the model.
+    wind
+        One of the region's test runs.
+    case, most_pitch
+        Bounds.
+    size
+        Nodes, horizon and tolerance.
+    inside
+        Keep states and controls inside the training range.
+    """
+    method = DirectTranscription(
+        scheme="trapezoidal",
+        mesh=size.points - 1,
+        refine=None,
+        tolerance=size.tolerance,
+        stay_inside=inside,
+    )
+    solution = solve(problem(region.model, wind, case, most_pitch, size.duration), method)
+    run, space = solution.trajectory, region.model.region
+    names = [c.name for c in region.model.signals.inputs]
+    values, low, high = run.select(names).values, np.asarray(space.low), np.asarray(space.high)
+    slack = 1e-9 * (high - low)
+    beyond = ((values < low - slack) | (values > high + slack)).mean(axis=0)
+    outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
+    recorded = wind.window(run.time[0], run.time[-1])
+    return Result(region.name, wind.name, case, most_pitch, inside, solution, recorded, outside)
+
+
+def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> ControlStudy:
+    """Solve both cases for every wind series and every limit of the platform pitch.
+
+    Parameters
+    ----------
+    regions
+        Models and runs.
+    size
+        How much to compute; None is the paper's size.
+    """
+    size = size or ControlStudySize()
+    begin, results = clock.perf_counter(), []
+    for region in regions:
+        own = turbine_case(region.training)
+        variants = [(PAPER, False), (own, False), *([(own, True)] if size.inside else [])]
+        for wind in region.tests:
+            for case, inside in variants:
+                for most_pitch in size.pitch_limits:
+                    results.append(optimise(region, wind, case, most_pitch, size, inside))
+    gains = {region.name: steady_gains(region.model) for region in regions}
+    return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
+
+
+def steady_gains(model: DFSM) -> tuple[float, float]:
+    """How the rotor speed of a model settles when torque or blade pitch rise for good.
+
+    Both gains are negative for a turbine: either brakes the rotor. Closed-loop data can teach a
+    model the reverse, because the controller raises both when the rotor is fast.
+
+    Parameters
+    ----------
+    model
+        Linearised at the mean of its training data.
+
+    Returns
+    -------
+    tuple of float
+        In rpm per MN m and in rpm per deg.
+    """
+    s, centre = model.signals, np.asarray(model.region.mean)
+    count = len(s.controls), len(s.disturbances), len(s.states)
+    u, w, x, p = np.split(centre, np.cumsum(count))
+    A, B, _, _ = model.jacobians(x, u, w, p)
+    gain = -np.linalg.solve(A, B)
+    row = gain[[c.name for c in s.states].index(SPEED)]
+    names = [c.name for c in s.controls]
+    return float(row[names.index(TORQUE)] * 1e3), float(row[names.index(BLADE)])

@@ -1,0 +1,181 @@
+"""Optimal control of the floating turbine on a coarse mesh: feasible, and the paper's trends."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dfsm.control import load_solution, save_solution
+from dfsm.corrective import NoCorrection
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.fit import fit
+from dfsm.report import write_solution_report
+from dfsm.report.publish import publish
+from dfsm.report.turbine_control import CLAIMS, control_article, trends
+from dfsm.studies.turbine_control import (
+    BLADE,
+    MOMENT,
+    PITCH,
+    SHEAR,
+    SPEED,
+    TORQUE,
+    ControlStudy,
+    ControlStudySize,
+    Region,
+    mean_power,
+    optimise,
+    problem,
+    steady_gains,
+    study,
+    turbine_case,
+)
+from systems import linear_model
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "iea15" / "optimal_control.py"
+SIZE = ControlStudySize(points=200, pitch_limits=(5.0, 7.0))
+
+
+@pytest.fixture(scope="module")
+def region() -> Region:
+    """The transition region, one wind series, fitted as the example does, without corrections."""
+    spec = importlib.util.spec_from_file_location("example_optimal_control", EXAMPLE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    data = module.demo()
+    # No corrections, which this model hardly has, to save time.
+    choices = replace(data.settings(5), corrective=NoCorrection(), nonlinear_only=False)
+    training, tests = data.runs(["12"], range(1, 9)), data.runs(["12"], range(9, 10))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        model = fit(training, choices).model
+    runs = [[r.window(data.START) for r in group] for group in (training, tests)]
+    return Region("12 m/s", model, *runs)
+
+
+@pytest.fixture(scope="module")
+def found(region: Region) -> ControlStudy:
+    return study([region], SIZE)
+
+
+def test_every_case_is_solved_within_its_bounds(found: ControlStudy):
+    assert [r.variant for r in found.results] == ["a", "a", "b", "b", "b, inside", "b, inside"]
+    for r in found.results:
+        assert r.solution.solved, r.solution.message
+        assert r.solution.violation < 1e-6
+        run = r.run
+        limits = {**r.case.bounds, PITCH: (r.case.lowest_pitch, r.most_pitch)}
+        for name, (low, high) in limits.items():
+            slack = 1e-6 * (high - low)
+            assert low - slack <= run[name].min(), name
+            assert run[name].max() <= high + slack, name
+        assert len(run.time) == SIZE.points
+        assert run.duration == pytest.approx(600)
+
+
+def test_bounds_of_this_turbine_come_from_its_own_runs(region: Region):
+    case = turbine_case(region.training)
+    for name in (SHEAR, MOMENT):
+        low, high = case.bounds[name]
+        share = np.mean(np.abs(np.concatenate([r[name] for r in region.training])) > high)
+        assert low == -high
+        assert share == pytest.approx(1e-3, rel=0.05)
+    run = region.tests[0]
+    assert np.mean(run["GenPwr"]) / 1e3 / mean_power(run) == pytest.approx(
+        case.efficiency, abs=2e-3
+    )
+
+
+def test_trends_of_the_paper_in_the_transition_region(found: ControlStudy):
+    for variant in ("b", "b, inside"):
+        told = trends(found.series()[found.results[0].series, variant])
+        assert list(told) == list(CLAIMS)
+        assert all(v.startswith("yes") for v in told.values()), told
+
+
+def test_power_is_in_megawatts_and_below_what_the_wind_holds(found: ControlStudy):
+    for r in found.results:
+        run = r.run
+        by_hand = np.mean(run[TORQUE] * 1e3 * run[SPEED] * 2 * np.pi / 60) / 1e6
+        assert r.power == pytest.approx(r.case.efficiency * by_hand, rel=0.01)
+        assert r.power < r.available
+        assert r.power == pytest.approx(r.recorded_power, rel=0.1)
+        assert np.mean(r.power_course) == pytest.approx(r.power, rel=0.01)
+
+
+def test_staying_inside_costs_little_and_keeps_the_controls_inside(found: ControlStudy):
+    results = {(r.variant, r.most_pitch): r for r in found.results}
+    free, inside = results["b", 5.0], results["b, inside", 5.0]
+    assert free.outside[TORQUE] > 0.5
+    assert not {TORQUE, BLADE, PITCH, SPEED} & set(inside.outside)
+    assert free.solution.objective < inside.solution.objective
+    assert inside.solution.objective == pytest.approx(free.solution.objective, rel=0.02)
+
+
+def test_bounds_that_cannot_be_met_are_named(region: Region):
+    case = turbine_case(region.training)
+    # A platform that must stay level in 12 m/s of wind, at rated torque and no blade pitch.
+    bounds = {**case.bounds, TORQUE: (19000.0, 19900.0), BLADE: (0.0, 1.0), SPEED: (1.9, 6.9)}
+    hard = replace(case, bounds=bounds)
+    r = optimise(region, region.tests[0], hard, 2.0, replace(SIZE, points=60))
+    assert not r.solution.solved
+    assert "dynamics of" in r.solution.message or "misses by" in r.solution.message
+    article = control_article(ControlStudy((r,), SIZE, 1.0, {}))
+    assert r.solution.message in " ".join(article.sections[1].paragraphs)
+    assert trends({2.0: r})[CLAIMS[0]] == "not solved"
+
+
+def test_the_page_holds_every_series_and_the_figures_every_limit(
+    found: ControlStudy, tmp_path: Path
+):
+    article = control_article(found)
+    for figure in article.figures():
+        assert figure.stacked
+        assert [p.title.split(" (")[0] for p in figure.panels] == [
+            *("RotWind", TORQUE, BLADE, PITCH, SPEED, "power", SHEAR, MOMENT)
+        ]
+        names = {c.name for c in figure.panels[3].curves}
+        assert names == {"Θp,max = 5 deg", "Θp,max = 7 deg", "bounds"}
+    # One figure is enough to print.
+    own = ControlStudy(found.results[2:4], found.size, found.seconds, found.gains)
+    written = publish(control_article(own), tmp_path)
+    tables = json.loads(written[1].read_text(encoding="utf-8"))
+    assert len(tables["control_12mps_s09"]) == 2
+    assert (tmp_path / "figures" / "control_12mps_s09_b.png").is_file()
+    assert "panels stacked" in written[0].read_text(encoding="utf-8")
+
+
+def test_a_solution_has_a_page_of_its_own_bounds_included(found: ControlStudy, tmp_path: Path):
+    solution = found.results[2].solution
+    save_solution(solution, tmp_path / "s")
+    loaded = load_solution(tmp_path / "s")
+    assert loaded.bounds.keys() == {TORQUE, BLADE, PITCH, SPEED, SHEAR, MOMENT}
+    write_solution_report(loaded, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    for channel in solution.trajectory.channels:
+        assert f"{channel.name} ({channel.unit})" in page
+
+
+def test_a_model_without_the_channels_is_refused(region: Region):
+    model = linear_model(-np.eye(1), np.eye(1))
+    case = turbine_case(region.training)
+    with pytest.raises(DfsmError, match="the model has no channel 'GenTq'"):
+        problem(model, region.tests[0], case, 5.0)
+
+
+def test_gains_are_those_of_the_steady_state():
+    # q̈ = −4 q − 2 q̇ + 3 u in steady state: q = 0.75 u.
+    A, B = np.array([[0, 1.0], [-4, -2]]), np.array([[0, 0], [3.0, -1]])
+    model = linear_model(A, B, names=[SPEED, "v"], units=["rpm", "rpm/s"])
+    channels = tuple(
+        replace(c, name=n) for c, n in zip(model.signals.controls, (TORQUE, BLADE), strict=True)
+    )
+    model = replace(model, signals=replace(model.signals, controls=channels))
+    assert steady_gains(model) == pytest.approx((750.0, -0.25))
