@@ -7,19 +7,18 @@ Exit codes: 0 done · 1 done, but a simulation ended early · 2 bad input · 3 a
 from __future__ import annotations
 
 import io
-import json
 import os
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dfsm.cli_control import check_run, export_rosco
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.progress import show_progress
+from dfsm.terminal import AsJson, Files, Quiet, lines, print_json, say, working
 
 if TYPE_CHECKING:
     from dfsm.simulate import Simulation
@@ -35,10 +34,8 @@ demos = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Studies that bring their own simulations."
 )
 app.add_typer(demos, name="demo")
-
-Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+app.command("export-rosco")(export_rosco)
+app.command("check-run")(check_run)
 
 
 @app.command()
@@ -50,7 +47,7 @@ def info(files: Files, as_json: AsJson = False) -> None:
     with show_progress():
         found = [describe(run) for run in read_all(files)]
     if as_json:
-        _print_json([f.to_dict() for f in found])
+        print_json([f.to_dict() for f in found])
     else:
         print_info(found)
 
@@ -71,9 +68,9 @@ def init(
     check_file(output)
     if output.exists() and not force:
         raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
-    with _working(quiet):
+    with working(quiet):
         write_config(files, output)
-    _say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
+    say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
 
 @app.command()
@@ -89,7 +86,7 @@ def fit(
     from dfsm.storage import check_target, save
 
     check_target(output)
-    with _working(quiet):
+    with working(quiet):
         settings, runs = load_config(config)
         result = run_fit(runs, settings.fit_settings(), settings.refine)
         model = result.model
@@ -100,11 +97,11 @@ def fit(
     if as_json:
         from dfsm.files import json_value
 
-        _print_json(json_value(dict(model.provenance.record)))
+        print_json(json_value(dict(model.provenance.record)))
         return
-    _say(_lines(model.summary()), quiet)
+    say(lines(model.summary()), quiet)
     seconds = sum(result.seconds.values())
-    _say(
+    say(
         f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",
         quiet,
     )
@@ -117,7 +114,7 @@ def summary(
     """Describe a saved model: signals, decisions, eigenvalues, warnings."""
     from dfsm.storage import load
 
-    typer.echo(_lines(load(model).summary()))
+    typer.echo(lines(load(model).summary()))
 
 
 @app.command()
@@ -156,7 +153,7 @@ def validate(
     main = next(iter(models.values()))
     settings = main.provenance.record.get("settings", {})
     start = settings.get("start") if start is None else start
-    with _working(quiet):
+    with working(quiet):
         runs = read_all(files)
         for path in targets:
             check_file(path, [wall_times, *(r.source for r in runs)])
@@ -171,7 +168,7 @@ def validate(
     if not quiet:
         print_validation(found)
     for path in targets:
-        _say(f"wrote {path}", quiet)
+        say(f"wrote {path}", quiet)
     _exit_if_ended([r.models[m].simulation for r in found.runs for m in ("multi-fidelity",)], quiet)
 
 
@@ -204,7 +201,7 @@ def simulate(
     surrogate = load(model)
     settings = surrogate.provenance.record.get("settings", {})
     start = settings.get("start") if start is None else start
-    with _working(quiet), warnings.catch_warnings():
+    with working(quiet), warnings.catch_warnings():
         warnings.simplefilter("ignore", DfsmWarning)  # the outcome is printed below
         result = run_simulate(
             surrogate,
@@ -215,7 +212,7 @@ def simulate(
         )
     write_table(result.trajectory, output)
     if as_json:
-        _print_json(
+        print_json(
             {
                 "status": result.status.name.lower(),
                 "message": result.message,
@@ -226,7 +223,7 @@ def simulate(
             }
         )
     else:
-        _say(f"wrote {output} ({len(result.trajectory)} samples): {result.message}", quiet)
+        say(f"wrote {output} ({len(result.trajectory)} samples): {result.message}", quiet)
     _exit_if_ended([result], quiet or as_json)
 
 
@@ -243,7 +240,7 @@ def wind(
     from dfsm.read import read_all, read_turbsim, with_field_wind, write_table
 
     source = read_turbsim(field)
-    with _working(quiet):
+    with working(quiet):
         runs = read_all(files)
         output.mkdir(parents=True, exist_ok=True)
         targets = [output / f"{run.name}.parquet" for run in runs]
@@ -252,7 +249,7 @@ def wind(
         added = [with_field_wind(run, source, radius) for run in runs]
     for run, target in zip(added, targets, strict=True):
         write_table(run, target)
-        _say(f"wrote {target} with RotWind, RotShearV and RotShearH", quiet)
+        say(f"wrote {target} with RotWind, RotShearV and RotShearH", quiet)
 
 
 @demos.command("two-link-robot")
@@ -273,11 +270,11 @@ def two_link_robot(
     from dfsm.studies.two_link_robot import QUICK, study
 
     page_of(output, KEY)
-    with _working(quiet):
+    with working(quiet):
         article = robot_article(study(QUICK if quick else None, seed))
     written = publish(article, output)
     if as_json:
-        _print_json(json_value(article.to_dict()))
+        print_json(json_value(article.to_dict()))
         return
     if not quiet:
         print_article(article)
@@ -286,7 +283,7 @@ def two_link_robot(
         if len(written) > 2
         else ("; figures for print need matplotlib: pip install 'dfsm[figures]'")
     )
-    _say(f"wrote {written[0]}, {written[1]}{figures}", quiet)
+    say(f"wrote {written[0]}, {written[1]}{figures}", quiet)
 
 
 def main() -> None:
@@ -352,29 +349,6 @@ def _unexpected(error: Exception) -> int:
 def _fail(message: str, code: int) -> int:
     print(printable(message), file=sys.stderr)
     return code
-
-
-@contextmanager
-def _working(quiet: bool) -> Iterator[None]:
-    """Long work: bars on a terminal; with --quiet neither these nor warnings."""
-    with show_progress(not quiet), warnings.catch_warnings():
-        if quiet:
-            warnings.simplefilter("ignore", DfsmWarning)
-        yield
-
-
-def _lines(text: str) -> str:
-    return "\n".join(printable(line) for line in text.split("\n"))
-
-
-def _say(message: str, quiet: bool) -> None:
-    if not quiet:
-        typer.echo(message)
-
-
-def _print_json(value: Any) -> None:
-    # ASCII, so that it is JSON in every terminal's encoding.
-    typer.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
 def _exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:

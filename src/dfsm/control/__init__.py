@@ -4,6 +4,7 @@
 nonlinear programs and `nlp` gives them to IPOPT.
 """
 
+from dfsm.control.check import RunCheck, check_run
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.shooting import MultipleShooting, SingleShooting
 from dfsm.control.signals import End, Signals
@@ -19,9 +20,11 @@ __all__ = [
     "MultipleShooting",
     "OptimalControlProblem",
     "Replay",
+    "RunCheck",
     "Signals",
     "SingleShooting",
     "Solution",
+    "check_run",
     "load_solution",
     "save_solution",
     "solve",

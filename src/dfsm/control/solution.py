@@ -91,6 +91,9 @@ class Solution:
     costates
         Per scenario: multipliers of the dynamics, ∂J/∂ξ, in the objective's unit per unit of each
         state.
+    limits
+        Bounds of the problem at the nodes, lower and upper, each of shape ``(time,)`` and infinite
+        where there is none, by channel; those of rates as ``"rate of …"``.
     multipliers
         Of path and boundary constraints by name, shape ``(scenario × time,)``, in the
         objective's unit per unit of the constraint.
@@ -137,6 +140,7 @@ class Solution:
     violation: float
     outside: float | None
     replays: tuple[Replay, ...] = ()
+    limits: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
     solver_state: Array = field(default_factory=lambda: np.empty(0))
 
     def __repr__(self) -> str:

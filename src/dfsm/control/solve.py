@@ -13,7 +13,7 @@ import numpy as np
 from dfsm.control.diagnose import conflict, require_finite, worst_violation
 from dfsm.control.guess import Start, start_of
 from dfsm.control.nlp import NlpOptions, Outcome, solve_nlp
-from dfsm.control.problem import OptimalControlProblem
+from dfsm.control.problem import OptimalControlProblem, level
 from dfsm.control.program import Program
 from dfsm.control.replay import replay
 from dfsm.control.shooting import MultipleShooting, Shooting, SingleShooting
@@ -244,6 +244,7 @@ def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -
         violation=worst_violation(program, z),
         outside=_outside(problem, trajectories),
         replays=replays,
+        limits=_limits(problem, trajectories[0].time),
         solver_state=outcome.multipliers,
     )
 
@@ -289,6 +290,15 @@ def _multipliers(program: Program, outcome: Outcome) -> dict[str, Array]:
         if not rows.name.startswith("dynamics of "):
             values = outcome.multipliers[rows.index] / program.row_scale[rows.index]
             found[rows.name] = np.append(found.get(rows.name, np.empty(0)), values)
+    return found
+
+
+def _limits(problem: OptimalControlProblem, time: Array) -> dict[str, tuple[Array, Array]]:
+    """Bounds and rates at the nodes, for whoever looks at a saved solution."""
+    found = {name: problem.limits(name, time) for name in problem.bounds}
+    for name, (low, high) in problem.rates.items():
+        rate = f"rate of {name}"
+        found[rate] = level(low, name, time, -np.inf), level(high, name, time, np.inf)
     return found
 
 

@@ -62,6 +62,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "solver_state": solution.solver_state,
     }
     tensors |= {f"multipliers/{n}": np.asarray(v) for n, v in solution.multipliers.items()}
+    for name, pair in solution.limits.items():
+        tensors[f"limits/{name}"] = np.stack(pair)
     manifest: dict[str, Any] = {"format": FORMAT, "dfsm": dfsm.__version__}
     manifest |= {key: getattr(solution, key) for key in _PLAIN}
     manifest |= {
@@ -103,17 +105,16 @@ def load_solution(path: str | Path) -> Solution:
                 _together("replays", manifest, tensors), manifest["deviations"], strict=True
             )
         ]
-        prefix = "multipliers/"
+        multipliers, limits = (_below(group, tensors) for group in ("multipliers/", "limits/"))
         return Solution(
             **plain,
             ending=Ending[manifest["ending"]],
             grid=Grid(**manifest["scheme"], edges=tensors["edges"]),
             trajectories=tuple(_together("trajectories", manifest, tensors)),
             costates=tuple(_together("costates", manifest, tensors)),
-            multipliers={
-                k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)
-            },
+            multipliers=multipliers,
             replays=tuple(replays),
+            limits={name: (pair[0], pair[1]) for name, pair in limits.items()},
             solver_state=tensors["solver_state"],
         )
     except (KeyError, TypeError, ValueError, ValidationError) as error:
@@ -142,6 +143,11 @@ def _together(
         )
         for k, told in enumerate(manifest[group])
     ]
+
+
+def _below(group: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
+    """Arrays whose name begins with `group`, by the rest of it."""
+    return {k.removeprefix(group): v for k, v in tensors.items() if k.startswith(group)}
 
 
 def _is_solution(path: Path) -> bool:

@@ -1,0 +1,44 @@
+"""What all commands of the terminal share: common options, progress, what is printed."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import typer
+
+from dfsm.errors import DfsmWarning, printable
+from dfsm.progress import show_progress
+
+Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+
+
+@contextmanager
+def working(quiet: bool) -> Iterator[None]:
+    """Long work: bars on a terminal; with --quiet neither these nor warnings."""
+    with show_progress(not quiet), warnings.catch_warnings():
+        if quiet:
+            warnings.simplefilter("ignore", DfsmWarning)
+        yield
+
+
+def lines(text: str) -> str:
+    """Text that may hold names, safe to print."""
+    return "\n".join(printable(line) for line in text.split("\n"))
+
+
+def say(message: str, quiet: bool) -> None:
+    """Print one line, unless --quiet was given."""
+    if not quiet:
+        typer.echo(message)
+
+
+def print_json(value: Any) -> None:
+    """Print a value that strict JSON can hold."""
+    # ASCII, so that it is JSON in every terminal's encoding.
+    typer.echo(json.dumps(value, indent=2, allow_nan=False))
