@@ -144,7 +144,7 @@ def test_the_price_of_a_miss_is_what_ending_there_costs_less(truth):
         for d in (-step, step)
     ]
     slope = (ends[1] - ends[0]) / (2 * step)
-    assert missed.price - exact.price == pytest.approx(-slope * step, rel=1e-3)
+    assert missed.price - exact.price == pytest.approx(-slope * step, rel=1e-2)
     wanted = {"angle": (1.0, 2.0)}
     assert realised(problem(PENDULUM, final=wanted), truth, moved).miss == {"angle": 0.0}
 

@@ -79,7 +79,7 @@ class Realised:
     miss
         Simulated minus required final state, by name; 0 inside the range that is required.
     price
-        −Σ λ miss with the solution's costates λ at the end: to first order, what it would cost to
+        Σ λ miss with the solution's costates λ at the end: to first order, what it would cost to
         end where it was required; negative where the miss made the run dearer.
     at_most
         Σ |λ| |miss|: the same if no part of the miss made up for another.
@@ -289,7 +289,7 @@ def realised(problem: OptimalControlProblem, found: Solution, run: Trajectory) -
         if name in problem.final:
             low, high = problem.end_limits("final", name)
             miss[name] = float(last - np.clip(last, low, high))
-            prices.append(-float(costates[name]) * miss[name])
+            prices.append(float(costates[name]) * miss[name])
     return Realised(cost, miss, sum(prices), sum(map(abs, prices)))
 
 
