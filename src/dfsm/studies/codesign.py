@@ -137,7 +137,7 @@ def problem(
     """Lift the arm with little torque and a mass that is given or free."""
     # A fit calls the rate of an angle after the angle.
     rate = "dot" if isinstance(model, DFSM) else "rate"
-    names = ("theta1", f"theta1_{rate}", "theta2", f"theta2_{rate}")
+    names = [str(n) for n in ("theta1", f"theta1_{rate}", "theta2", f"theta2_{rate}")]
     start, end = (dict(zip(names, MIDDLE + s * MOVE / 2, strict=True)) for s in (-1, 1))
     return OptimalControlProblem(
         model=model,
