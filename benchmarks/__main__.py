@@ -1,6 +1,7 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [control]
+    [codesign]
 """
 
 from __future__ import annotations
@@ -12,7 +13,16 @@ import platform
 import warnings
 
 import dfsm
-from benchmarks import accuracy, control, derivatives, parameters, rollouts, scaling, speed
+from benchmarks import (
+    accuracy,
+    codesign,
+    control,
+    derivatives,
+    parameters,
+    rollouts,
+    scaling,
+    speed,
+)
 from dfsm.files import json_value
 
 PARTS = {
@@ -23,6 +33,7 @@ PARTS = {
     "scaling": scaling.run,
     "rollouts": rollouts.run,
     "control": control.run,
+    "codesign": codesign.run,
 }
 
 

@@ -173,6 +173,47 @@ def sweep_table(figures: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def codesign_table(figures: Mapping[str, Any]) -> list[str]:
+    """A line per seed of the plant-and-control optimisation."""
+    lines = [
+        "| seed | runs | best m2, surrogate / truth | cost, surrogate / truth | this m2 costs "
+        "more by | arm misses its end by |",
+        "|---|---|---|---|---|---|",
+    ]
+    for seed, found in figures["codesign"].items():
+        cells = [
+            str(found["runs"]),
+            f"{found['mass']:.3f} / {found['true_mass']:.3f} kg",
+            f"{found['cost']:.4f} / {found['true_cost']:.4f}",
+            f"{100 * found['loss']:.2g} %",
+            f"{max(found['miss']['theta1'], found['miss']['theta2']):.2g} rad",
+        ]
+        lines.append(f"| {seed} | {' | '.join(cells)} |")
+    return lines
+
+
+def adaptive_table(figures: Mapping[str, Any]) -> list[str]:
+    """A line per seed of the adaptive loop."""
+    lines = [
+        "| seed | runs at first | simulations of optima | predicted | realised + price of the miss "
+        "| largest miss | truth | differences by round |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for seed, found in figures["adaptive"].items():
+        rounds = [None if d is None else 100 * d for d in found["differences"]]
+        cells = [
+            str(found["runs"]),
+            str(found["simulations"]) + ("" if found["status"] == "AGREED" else ", no agreement"),
+            f"{found['predicted']:.4f}",
+            f"{found['realised']:.4f} + {found['price']:.4f}",
+            f"{found['miss']:.1g}",
+            f"{found['true_cost']:.4f}",
+            ", ".join("–" if d is None else f"{d:.2g} %" for d in rounds),
+        ]
+        lines.append(f"| {seed} | {' | '.join(cells)} |")
+    return lines
+
+
 TABLES = {
     "accuracy": accuracy_table,
     "speed": speed_table,
@@ -181,6 +222,8 @@ TABLES = {
     "scaling": scaling_table,
 }
 ROLLOUT_TABLES = {"rollouts": rollouts_table, "loads": loads_table, "sweep": sweep_table}
+
+CODESIGN_TABLES = {"codesign": codesign_table, "adaptive": adaptive_table}
 
 
 def fill(path: Path, tables: Mapping[str, list[str]]) -> None:
@@ -202,6 +245,9 @@ def main() -> None:
     if "rollouts" in figures:
         for name, table in ROLLOUT_TABLES.items():
             tables[name] = table(figures["rollouts"])
+    if "codesign" in figures:
+        for name, table in CODESIGN_TABLES.items():
+            tables[name] = table(figures["codesign"])
     for path in FILES:
         fill(path, tables)
     if "scaling" in figures:

@@ -16,12 +16,17 @@ if TYPE_CHECKING:
     from dfsm.compare import RankedCandidate, Ranking, compare
     from dfsm.config import load_config
     from dfsm.control import (
+        AdaptiveResult,
+        AdaptiveSettings,
         DirectTranscription,
         MultipleShooting,
         OptimalControlProblem,
+        RunCheck,
         SingleShooting,
         Solution,
+        check_run,
         load_solution,
+        optimise_adaptively,
         save_solution,
         solve,
     )
@@ -29,6 +34,7 @@ if TYPE_CHECKING:
     from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.errors import DfsmError, DfsmWarning
     from dfsm.excitation import Chirp, Multisine, RandomKnots, RandomSteps, Uniform, excite
+    from dfsm.export import RoscoInput, write_rosco
     from dfsm.features import Feature
     from dfsm.fit import FitResult, fit
     from dfsm.intervals import Intervals, calibrate
@@ -131,6 +137,13 @@ _HOME = {
     "Solution": "control",
     "save_solution": "control",
     "load_solution": "control",
+    "AdaptiveSettings": "control",
+    "AdaptiveResult": "control",
+    "optimise_adaptively": "control",
+    "RunCheck": "control",
+    "check_run": "control",
+    "RoscoInput": "export",
+    "write_rosco": "export",
     "write_report": "report",
     "write_solution_report": "report",
     "load_config": "config",

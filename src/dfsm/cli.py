@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dfsm.cli_control import check_run, export_rosco
 from dfsm.cli_optimize import optimize
-from dfsm.cli_shared import AsJson, Files, Quiet, lines, print_json, say, working
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.progress import show_progress
+from dfsm.terminal import AsJson, Files, Quiet, lines, print_json, say, working
 
 if TYPE_CHECKING:
     from dfsm.simulate import Simulation
@@ -35,6 +36,8 @@ demos = typer.Typer(
 )
 app.add_typer(demos, name="demo")
 app.command()(optimize)
+app.command("export-rosco")(export_rosco)
+app.command("check-run")(check_run)
 
 
 @app.command()

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from dfsm.cli_shared import AsJson, Quiet, lines, print_json, say, working
+from dfsm.terminal import AsJson, Quiet, lines, print_json, say, working
 
 
 def optimize(

@@ -13,6 +13,7 @@ from dfsm.errors import printable
 
 if TYPE_CHECKING:
     from dfsm.compare import Ranking
+    from dfsm.control.check import RunCheck
     from dfsm.read.info import RunInfo
     from dfsm.report.article import Article
     from dfsm.validate import Validation
@@ -129,6 +130,38 @@ def print_ranking(found: Ranking) -> None:
     if found.best is not None:
         use = f"its model is {found.best.folder}: dfsm validate it on other runs"
         console.print(_text(f"best: {found.best.name}, {use}"))
+
+
+def print_check(found: RunCheck) -> None:
+    """Print how a high-fidelity run under optimal controls differs from the prediction."""
+    console = _console()
+    part = "the whole horizon" if found.complete else "a part of the horizon"
+    span = f"{found.start:g} to {found.stop:g} s, {part}"
+    console.print(_text(f"{found.run} against {found.name}, {span}; figures: predicted → actual"))
+    if found.power is not None:
+        ahead, came = found.power["predicted"], found.power["actual"]
+        console.print(_text(f"mean power ({found.power_source}): {ahead:.5g} → {came:.5g} kW"))
+    table = _table("channel", "unit", "mean", "max", "DEL m=4", "DEL m=10", "RMSE", "NRMSE")
+    for name, c in found.channels.items():
+        a, b = c.predicted, c.actual
+        pairs = [(a.mean, b.mean), (a.maximum, b.maximum)]
+        pairs += [(a.damage.get(m), b.damage.get(m)) for m in ("4", "10")]
+        cells = [
+            f"{_figure(x, '.4g')} → {_figure(y, '.4g')}" if x is not None else "" for x, y in pairs
+        ]
+        table.add_row(_text(name), _text(c.unit), *cells, f"{c.rmse:.3g}", f"{c.nrmse:.3f}")
+    console.print(table)
+    if found.limits:
+        table = _table("channel", "beyond its limits by", "at", "share of samples")
+        for name, limit in found.limits.items():
+            at = "" if limit.at is None else f"{limit.at:g} s"
+            beyond = f"{limit.predicted:.3g} → {limit.actual:.3g}"
+            table.add_row(_text(name), beyond, at, f"{limit.share:.1%}")
+        console.print(table)
+    else:
+        console.print("no bounds of these channels are saved with the solution")
+    if found.missing:
+        console.print(_text(f"not in the run: {', '.join(found.missing)}"))
 
 
 def print_article(article: Article) -> None:

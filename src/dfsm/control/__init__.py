@@ -4,6 +4,16 @@
 nonlinear programs and `nlp` gives them to IPOPT.
 """
 
+from dfsm.control.adaptive import (
+    AdaptiveResult,
+    AdaptiveSettings,
+    Agreement,
+    Realised,
+    Round,
+    optimise_adaptively,
+    realised,
+)
+from dfsm.control.check import RunCheck, check_run
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.shooting import MultipleShooting, SingleShooting
 from dfsm.control.signals import End, Signals
@@ -13,16 +23,25 @@ from dfsm.control.storage import load_solution, save_solution
 from dfsm.control.transcription import DirectTranscription
 
 __all__ = [
+    "AdaptiveResult",
+    "AdaptiveSettings",
+    "Agreement",
     "DirectTranscription",
     "End",
     "Ending",
     "MultipleShooting",
     "OptimalControlProblem",
+    "Realised",
     "Replay",
+    "Round",
+    "RunCheck",
     "Signals",
     "SingleShooting",
     "Solution",
+    "check_run",
     "load_solution",
+    "optimise_adaptively",
+    "realised",
     "save_solution",
     "solve",
 ]

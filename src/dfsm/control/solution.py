@@ -14,6 +14,9 @@ from dfsm.errors import printable
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 
+# Before the name of a control in `Solution.bounds`: bounds of its rate.
+RATE = "rate of "
+
 
 class Ending(enum.Enum):
     """How a solve ended; the value says what it means and what to do."""
@@ -116,7 +119,8 @@ class Solution:
         Per scenario, see `Replay`; empty where it was not asked for.
     bounds
         By name of the states, controls and outputs that have any: lower and upper bounds at the
-        nodes, shape ``(2, time)``, infinite where there is none.
+        nodes, shape ``(2, time)``, infinite where there is none; those of a control's rate as
+        ``"rate of …"``.
     solver_state
         Scaled multipliers, to start the same mesh warm.
     """

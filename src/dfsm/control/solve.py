@@ -13,11 +13,11 @@ import numpy as np
 from dfsm.control.diagnose import conflict, require_finite, worst_violation
 from dfsm.control.guess import Start, start_of
 from dfsm.control.nlp import NlpOptions, Outcome, solve_nlp
-from dfsm.control.problem import OptimalControlProblem
+from dfsm.control.problem import OptimalControlProblem, level
 from dfsm.control.program import Program
 from dfsm.control.replay import replay
 from dfsm.control.shooting import MultipleShooting, Shooting, SingleShooting
-from dfsm.control.solution import Ending, Solution
+from dfsm.control.solution import RATE, Ending, Solution
 from dfsm.control.transcription import DirectTranscription, Transcription, node_data
 from dfsm.errors import DfsmError
 from dfsm.trajectory import Role, Trajectory
@@ -302,6 +302,9 @@ def _bounds(shot: Shot, time: Array) -> dict[str, Array]:
             pair = np.stack(limits(name, time))
             if np.isfinite(pair).any():
                 found[name] = pair
+    for name, (low, high) in shot.problem.rates.items():
+        pair = level(low, name, time, -np.inf), level(high, name, time, np.inf)
+        found[f"{RATE}{name}"] = np.stack(pair)
     return found
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: common options, progress, and printing that cannot break a terminal."""
+"""What all commands of the terminal share: common options, progress, what is printed."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def working(quiet: bool) -> Iterator[None]:
 
 
 def lines(text: str) -> str:
-    """Escape what a terminal would act on, line by line."""
+    """Text that may hold names, safe to print."""
     return "\n".join(printable(line) for line in text.split("\n"))
 
 
 def say(message: str, quiet: bool) -> None:
-    """Print a line unless asked to be quiet."""
+    """Print one line, unless --quiet was given."""
     if not quiet:
         typer.echo(message)
 
 
 def print_json(value: Any) -> None:
-    """Print a JSON value."""
+    """Print a value that strict JSON can hold."""
     # ASCII, so that it is JSON in every terminal's encoding.
     typer.echo(json.dumps(value, indent=2, allow_nan=False))

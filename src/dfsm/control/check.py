@@ -1,0 +1,295 @@
+"""A high-fidelity run under optimal controls, against what the solution had predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from dfsm.control.solution import RATE, Solution
+from dfsm.errors import DfsmError, missing, printable
+from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.files import json_value
+from dfsm.settings import require
+from dfsm.trajectory import Role, Trajectory
+from dfsm.types import Array
+from dfsm.units import POWERS, SPEEDS, TORQUES, plain
+
+# Limits count as kept within this part of their size.
+_SLACK = 1e-6
+
+
+@dataclass(frozen=True)
+class Figures:
+    """One signal in figures, in its unit.
+
+    Attributes
+    ----------
+    minimum, mean, maximum
+        Over the time compared.
+    damage
+        1 Hz damage-equivalent load per Wöhler exponent, outputs only.
+    """
+
+    minimum: float
+    mean: float
+    maximum: float
+    damage: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ChannelCheck:
+    """One channel, predicted and as it came.
+
+    Attributes
+    ----------
+    unit, role
+        As in the solution.
+    rmse, largest
+        Of the difference, in the channel's unit.
+    nrmse
+        RMSE over the standard deviation of the run's signal; infinite for a constant.
+    predicted, actual
+        Figures of both.
+    """
+
+    unit: str
+    role: Role | None
+    rmse: float
+    largest: float
+    nrmse: float
+    predicted: Figures
+    actual: Figures
+
+
+@dataclass(frozen=True)
+class LimitCheck:
+    """How well one bound of the problem was kept.
+
+    Attributes
+    ----------
+    predicted, actual
+        Largest excess over a limit in the channel's unit, 0 where it is kept.
+    at
+        Time of the run's largest excess in s; None where it is kept.
+    share
+        Share of the run's samples beyond a limit.
+    """
+
+    predicted: float
+    actual: float
+    at: float | None
+    share: float
+
+
+@dataclass(frozen=True)
+class RunCheck:
+    """A high-fidelity run under optimal controls against the prediction.
+
+    Attributes
+    ----------
+    name, run
+        Of the solution and of the run.
+    start, stop
+        The time compared, in s: what both have.
+    complete
+        Whether that is the whole horizon.
+    power
+        Mean power in kW, ``predicted`` and ``actual``; None where no channel tells it.
+    power_source
+        The channels that tell the power.
+    limits
+        By channel, ``"rate of …"`` for rates; bounds without a channel in the run are left out.
+    channels
+        By name, in the solution's order.
+    missing
+        Channels of the solution that the run lacks.
+    """
+
+    name: str
+    run: str
+    start: float
+    stop: float
+    complete: bool
+    power: Mapping[str, float] | None
+    power_source: str
+    limits: Mapping[str, LimitCheck]
+    channels: Mapping[str, ChannelCheck]
+    missing: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values; None where not finite."""
+        return dict(json_value({"format": 1, **asdict(self)}))
+
+
+def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunCheck:
+    """Compare a run of the true system under the optimal controls with the prediction.
+
+    Parameters
+    ----------
+    solution
+        From `solve` or `load_solution`.
+    run
+        Of the same controls and disturbances, with channels named as in the solution. Channels
+        that it lacks are left out and listed.
+    scenario
+        The one whose controls were used, counted from 1.
+
+    Returns
+    -------
+    RunCheck
+
+    Raises
+    ------
+    DfsmError
+        Run and horizon have no time in common, the run has none of the channels, one in another
+        unit, or samples that are not finite.
+    """
+    count = len(solution.trajectories)
+    require(1 <= scenario <= count, "scenario", scenario, f"1 to {count}")
+    full = solution.trajectories[scenario - 1]
+    kept = [c.name for c in full.channels if c.name in run and c.role != "parameter"]
+    absent = tuple(c.name for c in full.channels if c.name not in run and c.role != "parameter")
+    if not kept:
+        raise DfsmError(f"{run.where}: {missing(absent, run.names)}")
+    _check_units(full, run, kept)
+    actual = _common(full, run).select(kept).require_finite()
+    predicted = _prediction(solution, scenario - 1, actual.time).select(kept)
+    slack = 1e-6 * full.duration
+    power, source = _power(predicted, actual)
+    return RunCheck(
+        name=solution.name,
+        run=run.where,
+        start=float(actual.time[0]),
+        stop=float(actual.time[-1]),
+        complete=bool(
+            run.time[0] <= full.time[0] + slack and run.time[-1] >= full.time[-1] - slack
+        ),
+        power=power,
+        power_source=source,
+        limits=_limits(solution, full.time, predicted, actual),
+        channels={name: _channel(predicted, actual, name) for name in kept},
+        missing=absent,
+    )
+
+
+def _check_units(full: Trajectory, run: Trajectory, names: Sequence[str]) -> None:
+    for name in names:
+        ours, theirs = full.channel(name).unit, run.channel(name).unit
+        if plain(ours) != plain(theirs):
+            raise DfsmError(
+                f"{run.where}: '{name}' is in '{theirs}', in the solution in '{ours}': convert one "
+                "of them"
+            )
+
+
+def _common(full: Trajectory, run: Trajectory) -> Trajectory:
+    """The part of the run that lies in the horizon."""
+    start, stop = (max(full.time[0], run.time[0]), min(full.time[-1], run.time[-1]))
+    if stop <= start:
+        raise DfsmError(
+            f"{run.where}: runs from {run.time[0]:g} s to {run.time[-1]:g} s, the horizon from "
+            f"{full.time[0]:g} s to {full.time[-1]:g} s: they have no time in common"
+        )
+    return run.window(float(start), float(stop))
+
+
+def _prediction(solution: Solution, scenario: int, time: Array) -> Trajectory:
+    """All channels of the solution at times in s; states and controls by its own polynomials."""
+    full = solution.trajectories[scenario]
+    time = np.clip(time, full.time[0], full.time[-1])
+    found = full.resample(time)
+    values = np.array(found.values)
+    parts = solution.at((time - full.time[0]) / full.duration, scenario)
+    for role, part in zip(("state", "control"), parts, strict=True):
+        values[:, [i for i, c in enumerate(full.channels) if c.role == role]] = part
+    return Trajectory(time, values, full.channels, name=full.name)
+
+
+def _channel(predicted: Trajectory, actual: Trajectory, name: str) -> ChannelCheck:
+    channel, difference = predicted.channel(name), predicted[name] - actual[name]
+    rmse, spread = float(np.sqrt(np.mean(difference**2))), float(actual[name].std())
+    is_load = channel.role == "output"
+    return ChannelCheck(
+        unit=channel.unit,
+        role=channel.role,
+        rmse=rmse,
+        largest=float(np.abs(difference).max()),
+        # A constant has a spread of rounding errors.
+        nrmse=rmse / spread if spread > 1e-12 * np.abs(actual[name]).max() else np.inf,
+        predicted=_figures(predicted, name, is_load),
+        actual=_figures(actual, name, is_load),
+    )
+
+
+def _figures(run: Trajectory, name: str, is_load: bool) -> Figures:
+    values = run[name]
+    damage = {
+        f"{m:g}": damage_equivalent_load(values, run.duration, m)
+        for m in (WOHLER_EXPONENTS if is_load else ())
+    }
+    mean = float(np.trapezoid(values, run.time)) / run.duration
+    return Figures(float(values.min()), mean, float(values.max()), damage)
+
+
+def _limits(
+    solution: Solution, nodes: Array, predicted: Trajectory, actual: Trajectory
+) -> dict[str, LimitCheck]:
+    found = {}
+    for name, pair in solution.bounds.items():
+        channel = name.removeprefix(RATE)
+        if channel not in actual:
+            continue
+        time, signals = actual.time, [predicted[channel], actual[channel]]
+        # A recorded value may lie one rounding beyond its limit.
+        rounding = actual.channel(channel).step or 0.0
+        if name.startswith(RATE):
+            signals = [np.diff(s) / np.diff(time) for s in signals]
+            rounding /= float(np.diff(time).min())
+            time = (time[1:] + time[:-1]) / 2
+        low, high = (_between(time, nodes, limit) for limit in pair)
+        excess = [np.maximum(np.maximum(low - s, s - high), 0.0) for s in signals]
+        size = np.abs([*low, *high])
+        slack = rounding + _SLACK * size[np.isfinite(size)].max(initial=0.0)
+        excess = [np.where(e > slack, e, 0.0) for e in excess]
+        worst = int(np.argmax(excess[1]))
+        most = float(excess[1][worst])
+        found[name] = LimitCheck(
+            predicted=float(excess[0].max()),
+            actual=most,
+            at=float(time[worst]) if most > 0 else None,
+            share=float(np.mean(excess[1] > 0)),
+        )
+    return found
+
+
+def _between(time: Array, nodes: Array, limit: Array) -> Array:
+    """A limit between the nodes; one that is infinite somewhere holds its next value."""
+    if np.isfinite(limit).all():
+        return np.interp(time, nodes, limit)
+    return limit[np.clip(np.searchsorted(nodes, time), 0, len(nodes) - 1)]
+
+
+def _power(predicted: Trajectory, actual: Trajectory) -> tuple[dict[str, float] | None, str]:
+    """Mean power in kW: of a channel that holds it, else of the only torque and the only speed."""
+
+    def of(units: Mapping[str, float], group: tuple[Role, ...]) -> list[tuple[str, float]]:
+        chosen = [c for c in predicted.channels if plain(c.unit) in units and c.role in group]
+        return [(c.name, units[plain(c.unit)]) for c in chosen]
+
+    factors = of(POWERS, ("output", "state"))[:1]
+    if not factors:
+        torques = of(TORQUES, ("control",))
+        speeds = of({"rpm": SPEEDS["rpm"]}, ("state", "output"))
+        if len(torques) != 1 or len(speeds) != 1:
+            return None, ""
+        factors = [torques[0], (speeds[0][0], speeds[0][1] / 1000)]
+
+    def mean(run: Trajectory) -> float:
+        power = np.prod([factor * run[name] for name, factor in factors], axis=0)
+        return float(np.trapezoid(power, run.time)) / run.duration
+
+    source = " × ".join(printable(name) for name, _ in factors)
+    return {"predicted": mean(predicted), "actual": mean(actual)}, source

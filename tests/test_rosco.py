@@ -1,0 +1,238 @@
+"""Optimal controls to a file of ROSCO, and a high-fidelity run against the prediction."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dfsm.control import (
+    DirectTranscription,
+    OptimalControlProblem,
+    check_run,
+    load_solution,
+    save_solution,
+    solve,
+)
+from dfsm.errors import DfsmError
+from dfsm.export import write_rosco
+from dfsm.fatigue import damage_equivalent_load
+from dfsm.read import write_table
+from dfsm.simulators import ODESystem
+from dfsm.trajectory import Channel, Trajectory
+
+MOST = 7.56  # rpm
+
+
+def turbine(drag: float = 1.0, torque: str = "kN-m", pitch: str = "deg") -> ODESystem:
+    """A rotor that spins up in a steady wind; its tower load follows from pitch and speed."""
+    to_kn = {"kN-m": 1.0, "N-m": 1e-3, "MN·m": 1e3, "lbf ft": 1.0}[torque]
+    to_deg = {"deg": 1.0, "rad": 180 / np.pi}.get(pitch, 1.0)
+
+    def f(x, u, _w, _p):
+        power = 18 - 0.8 * to_deg * u[1] - 0.05 * drag * x[0] ** 2
+        return jnp.stack([0.1 * (power - 1e-3 * to_kn * u[0])])
+
+    def g(x, u, _w, _p):
+        return jnp.stack([2.0 * x[0] ** 2 * (1 - 0.03 * to_deg * u[1])])
+
+    return ODESystem(
+        f,
+        states=(Channel("GenSpeed", "rpm"),),
+        controls=(Channel("GenTq", torque), Channel("BldPitch1", pitch)),
+        outputs=(Channel("TwrBsMyt", "kN-m"),),
+        g=g,
+        name="turbine",
+    )
+
+
+@pytest.fixture(scope="module")
+def solution():
+    found = solve(
+        OptimalControlProblem(
+            model=turbine(),
+            horizon=(100.0, 130.0),
+            cost=lambda s: 1e-6 * (s.u.GenTq - 13000) ** 2 + (s.u.BldPitch1 - 2) ** 2,
+            initial={"GenSpeed": 7.0},
+            bounds={"GenSpeed": (5.0, MOST), "GenTq": (0.0, 21000.0), "BldPitch1": (0.0, 20.0)},
+            rates={"BldPitch1": (-2.0, 2.0)},
+            name="spin up",
+        ),
+        DirectTranscription(mesh=30, refine=None),
+    )
+    assert found.solved
+    return found
+
+
+@pytest.fixture
+def result(solution, tmp_path):
+    save_solution(solution, tmp_path / "result")
+    return tmp_path / "result"
+
+
+@pytest.fixture(scope="module")
+def run(solution):
+    """What a turbine does that is braked less than the model believes."""
+    optimum = solution.trajectory
+    time = np.linspace(100, 130, 301)
+    controls = optimum.select(["GenTq", "BldPitch1"])
+    return turbine(drag=0.97).simulate(time, [7.0], controls, name="truth")
+
+
+# -- export -------------------------------------------------------------------------------------
+
+
+def table(path):
+    return np.loadtxt(path, comments="!")
+
+
+def test_the_file_holds_time_pitch_and_torque_in_units_of_rosco(solution, tmp_path):
+    written = write_rosco(solution, tmp_path / "ol.dat")
+    found, optimum = table(tmp_path / "ol.dat"), solution.trajectory
+    assert (written.pitch, written.torque, written.rows) == ("BldPitch1", "GenTq", len(optimum))
+    np.testing.assert_allclose(found[:, 0], optimum.time, rtol=1e-9)
+    np.testing.assert_allclose(found[:, 1], np.radians(optimum["BldPitch1"]), atol=1e-9)
+    np.testing.assert_allclose(found[:, 2], 1000 * optimum["GenTq"], rtol=1e-8)
+    heads = [t for t in (tmp_path / "ol.dat").read_text().splitlines() if t.startswith("!")]
+    assert heads[-1] == "! Time (s)  BldPitch1 (rad)  GenTq (N m)"
+    assert written.discon == {
+        "OL_Mode": "1",
+        "OL_Filename": '"ol.dat"',
+        "Ind_Breakpoint": "1",
+        "Ind_BldPitch": "2 2 2",
+        "Ind_GenTq": "3",
+    }
+
+
+@pytest.mark.parametrize(("torque", "factor"), [("N-m", 1.0), ("MN·m", 1e6), ("kN-m", 1e3)])
+@pytest.mark.parametrize(("pitch", "angle"), [("rad", 1.0), ("deg", np.pi / 180)])
+def test_units_are_those_of_the_channels(solution, tmp_path, torque, factor, pitch, angle):
+    given = with_units(solution, GenTq=torque, BldPitch1=pitch)
+    write_rosco(given, tmp_path / "ol.dat")
+    found, optimum = table(tmp_path / "ol.dat"), solution.trajectory
+    np.testing.assert_allclose(found[:, 1], angle * optimum["BldPitch1"], atol=1e-9)
+    np.testing.assert_allclose(found[:, 2], factor * optimum["GenTq"], rtol=1e-8)
+
+
+def test_torque_alone_and_rows_between_the_nodes(solution, tmp_path):
+    written = write_rosco(with_units(solution, BldPitch1="-"), tmp_path / "ol.dat", step=0.25)
+    found = table(tmp_path / "ol.dat")
+    assert found.shape == (121, 2)
+    np.testing.assert_allclose(found[:, 0], np.linspace(100, 130, 121))
+    tau = np.linspace(0, 1, 121)
+    np.testing.assert_allclose(found[:, 1], 1000 * solution.at(tau)[1][:, 0], rtol=1e-8)
+    assert written.discon["Ind_BldPitch"] == "0 0 0"
+    assert written.discon["Ind_GenTq"] == "2"
+
+
+def test_controls_that_are_none_or_too_many_earn_a_sentence(solution, tmp_path):
+    path = tmp_path / "ol.dat"
+    nothing = with_units(solution, GenTq="mN-m", BldPitch1="%")
+    with pytest.raises(DfsmError, match="its controls are GenTq in 'mN-m', BldPitch1 in '%'"):
+        write_rosco(nothing, path)
+    both = with_units(solution, BldPitch1="kN m")
+    with pytest.raises(DfsmError, match="the torque may be GenTq or BldPitch1"):
+        write_rosco(both, path)
+    assert write_rosco(both, path, torque="GenTq").torque == "GenTq"
+    with pytest.raises(DfsmError, match="pitch: 'GenTq' is in 'kN-m', expected an angle"):
+        write_rosco(solution, path, pitch="GenTq")
+    with pytest.raises(DfsmError, match="did you mean 'BldPitch1'"):
+        write_rosco(solution, path, pitch="BldPitch")
+    with pytest.raises(DfsmError, match="scenario is 2, expected 1 to 1"):
+        write_rosco(solution, path, scenario=2)
+    with pytest.raises(DfsmError, match="step is -1"):
+        write_rosco(solution, path, step=-1)
+
+
+def test_the_command_prints_what_to_set(result, tmp_path, dfsm):
+    shown = dfsm("export-rosco", result, "-o", tmp_path / "ol.dat")
+    assert shown.code == 0
+    assert "2 2 2                ! Ind_BldPitch" in shown.out
+    assert "1                    ! Ptch_Cntrl" in shown.out
+    shown = dfsm("export-rosco", result, "-o", tmp_path / "ol.dat", "--json")
+    assert json.loads(shown.out)["discon"]["Ind_GenTq"] == "3"
+    assert "there is no folder" in dfsm("export-rosco", result, "-o", "no/ol.dat").sentence
+    assert "is no folder of a solution" in dfsm("export-rosco", tmp_path, "-o", "x.dat").sentence
+
+
+# -- the way back -------------------------------------------------------------------------------
+
+
+def test_a_run_of_the_same_system_is_as_predicted(solution):
+    time = np.linspace(100, 130, 601)
+    tau = (time - 100) / 30
+    controls = solution.trajectory.select(["GenTq", "BldPitch1"]).channels
+    same = turbine().simulate(
+        time, [7.0], Trajectory(time, solution.at(tau)[1], controls), name="same"
+    )
+    found = check_run(solution, same)
+    assert found.complete
+    assert found.missing == ()
+    assert found.channels["GenSpeed"].rmse < 1e-3
+    assert found.channels["GenTq"].largest < 1e-9
+    assert found.power["actual"] == pytest.approx(found.power["predicted"], rel=1e-3)
+
+
+def test_a_run_of_another_system_is_told_apart(solution, run):
+    found = check_run(solution, run)
+    speed, load = found.channels["GenSpeed"], found.channels["TwrBsMyt"]
+    assert found.limits["GenSpeed"].predicted < 1e-3
+    assert found.limits["GenSpeed"].actual == pytest.approx(run["GenSpeed"].max() - MOST)
+    assert found.limits["GenSpeed"].actual > 0.05
+    assert run.time[np.argmax(run["GenSpeed"])] == found.limits["GenSpeed"].at
+    assert found.limits["GenTq"].actual == 0.0
+    assert found.limits["GenTq"].at is None
+    assert set(found.limits) == {"GenSpeed", "GenTq", "BldPitch1", "rate of BldPitch1"}
+    assert speed.rmse > 0.02
+    assert load.actual.damage["4"] == damage_equivalent_load(run["TwrBsMyt"], 30.0, 4)
+    assert load.actual.maximum == run["TwrBsMyt"].max()
+    power = run["GenTq"] * run["GenSpeed"] * np.pi / 30
+    assert found.power["actual"] == pytest.approx(np.trapezoid(power, run.time) / 30)
+    assert found.power_source == "GenTq × GenSpeed"
+
+
+def test_parts_and_missing_channels_are_told(solution, run):
+    part = run.select(["GenSpeed"]).window(110, 120)
+    found = check_run(solution, part)
+    assert (found.start, found.stop, found.complete) == (110.0, 120.0, False)
+    assert found.missing == ("GenTq", "BldPitch1", "TwrBsMyt")
+    assert found.power is None
+
+
+def test_runs_that_do_not_fit_earn_a_sentence(solution, run):
+    with pytest.raises(DfsmError, match="they have no time in common"):
+        check_run(solution, replace(run, time=run.time + 100))
+    other = tuple(replace(c, name="x" + c.name) for c in run.channels)
+    with pytest.raises(DfsmError, match="no channels 'GenSpeed'"):
+        check_run(solution, replace(run, channels=other))
+    other = tuple(replace(c, unit="rad/s" if c.unit == "rpm" else c.unit) for c in run.channels)
+    with pytest.raises(DfsmError, match="'GenSpeed' is in 'rad/s', in the solution in 'rpm'"):
+        check_run(solution, replace(run, channels=other))
+
+
+def test_limits_survive_saving(solution, result, run):
+    assert check_run(load_solution(result), run) == check_run(solution, run)
+
+
+def test_the_command_prints_tables_and_json(result, run, tmp_path, dfsm):
+    write_table(run, tmp_path / "run.parquet")
+    shown = dfsm("check-run", result, tmp_path / "run.parquet")
+    assert shown.code == 0
+    assert "mean power (GenTq × GenSpeed)" in shown.out
+    assert "beyond its limits by" in shown.out
+    assert "TwrBsMyt" in shown.out
+    shown = dfsm("check-run", result, tmp_path / "run.parquet", "--json")
+    found = json.loads(shown.out)
+    assert found["limits"]["GenSpeed"]["actual"] > 0.05
+    assert "no.parquet" in dfsm("check-run", result, "no.parquet").sentence
+
+
+def with_units(solution, **units):
+    def changed(run):
+        channels = [replace(c, unit=units.get(c.name, c.unit)) for c in run.channels]
+        return replace(run, channels=tuple(channels))
+
+    return replace(solution, trajectories=tuple(map(changed, solution.trajectories)))
