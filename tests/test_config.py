@@ -278,7 +278,7 @@ def test_missing_files_and_folders(tmp_path):
     with pytest.raises(DfsmError, match=r"none\.yaml cannot be read .*: make one with dfsm init"):
         parse_config(tmp_path / "none.yaml")
     folder = re.escape(f"{tmp_path} is a folder, a configuration file was expected: ")
-    with pytest.raises(DfsmError, match=folder + "name one, or use dfsm init"):
+    with pytest.raises(DfsmError, match=folder + "name one, or make one with dfsm init"):
         parse_config(tmp_path)
     for name in ("other.yml", "config.yaml", "third.yaml"):  # config.yaml wins over any other
         (tmp_path / name).touch()
