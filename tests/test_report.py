@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from dfsm.console import print_validations
 from dfsm.corrective import RBF
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError
@@ -335,3 +336,11 @@ def test_embedded_json_is_inert_and_intact():
     given = {"</script>": "<!--&\u2028\u2029"}
     assert not re.search("[<>&\u2028\u2029]", embed(given))
     assert json.loads(embed(given)) == given
+
+
+def test_the_terminal_leaves_out_what_was_not_fitted(validation, capsys):
+    fewer = {name: m for name, m in validation.models.items() if name != "nonlinear-only"}
+    print_validations({"all": validation, "some": replace(validation, models=fewer)})
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    first, second = (next(r for r in rows if r and r[0] == label) for label in ("all", "some"))
+    assert len(first) == len(second) + ("nonlinear-only" in validation.models)

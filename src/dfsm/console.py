@@ -64,7 +64,9 @@ def print_validations(found: Mapping[str, Validation]) -> None:
         for i, c in enumerate(validation.channels):
             row: list[str | Text] = [_text(label if i == 0 else "")] if several else []
             row += [_text(c.name), _text(c.unit)]
-            row += [_figure(validation.mean_nrmse(v, c.name), ".3f") for v in variants]
+            for v in variants:
+                known = v in validation.models
+                row.append(_figure(validation.mean_nrmse(v, c.name), ".3f") if known else "")
             row += [
                 _figure(validation.mean_error("multi-fidelity", c.name, what), ".4g")
                 for what in ("rmse", "maximum")
