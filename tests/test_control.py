@@ -353,8 +353,8 @@ def test_a_solution_is_saved_and_loaded(tmp_path, method):
         loaded.replays[0].trajectory.values, found.replays[0].trajectory.values
     )
     np.testing.assert_array_equal(loaded.multipliers["force"], found.multipliers["force"])
-    np.testing.assert_array_equal(loaded.limits["force"], found.limits["force"])
-    assert set(loaded.limits["force"][1]) == {1.45}
+    np.testing.assert_array_equal(loaded.bounds["force"], found.bounds["force"])
+    assert set(loaded.bounds["force"][1]) == {1.45}
     again = solved(given, method, guess=loaded)
     assert again.objective == pytest.approx(found.objective, rel=1e-7)
     save_solution(found, tmp_path / "s")  # replaces it
