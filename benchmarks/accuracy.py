@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 DEMO = Path(__file__).parents[1] / "examples" / "iea15" / "demo.py"
 
 
+@cache
 def demo() -> ModuleType:
     """The demo as a module."""
     spec = importlib.util.spec_from_file_location("iea15_demo", DEMO)

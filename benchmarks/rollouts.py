@@ -195,8 +195,7 @@ def sweep(model: dfsm.DFSM) -> dict[str, Any]:
     and drift over the last 100 s in standard deviations per second, at every wind.
     """
     s, region = model.signals, model.region
-    n_uw, observed = len(s.driving), len(s.observed)
-    columns = slice(n_uw, n_uw + observed)
+    columns, observed = s.observed_columns, len(s.observed)
     low, high, std = (np.asarray(a)[columns] for a in (region.low, region.high, region.std))
     grid, operating = np.asarray(region.grid), np.asarray(region.operating)
     found = {}

@@ -401,7 +401,7 @@ def test_ctrl_c_leaves_nothing_half_written(here, dfsm, monkeypatch, command):
     if command == "fit":
         monkeypatch.setattr("dfsm.samples.differentiate", interrupt)
     else:
-        monkeypatch.setattr("dfsm.storage.json_bytes", interrupt)
+        monkeypatch.setattr("dfsm.bundle.json_bytes", interrupt)
     before = files_of(here)
     shown = dfsm("fit", "c.yaml", "-o", "m")
     assert (shown.code, shown.out) == (130, "")

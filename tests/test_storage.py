@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+import dfsm.bundle
 import dfsm.storage
 from conftest import files_of
 from dfsm.config import load_config
@@ -191,7 +192,7 @@ def test_a_failed_save_keeps_the_old_model(models, tmp_path, monkeypatch, place,
 
         monkeypatch.setattr(Path, "rename", once)
     else:
-        monkeypatch.setattr(dfsm.storage, place, fail)
+        monkeypatch.setattr(dfsm.bundle, place, fail)
     with pytest.raises(DfsmError if failure else KeyboardInterrupt) as caught:
         save(models["rbf"][0].model, path)
     if failure:
@@ -291,7 +292,7 @@ def test_a_manifest_whose_checksum_holds_but_whose_content_does_not(model):
     manifest = json.loads(file.read_text(encoding="utf-8"))
     for key, value in (("models", []), ("signals", {}), ("models", {"multi-fidelity": {}})):
         forged = manifest | {key: value}
-        forged["checksum"] = dfsm.storage._checksum(forged)
+        forged["checksum"] = dfsm.bundle._checksum(forged)
         file.write_text(json.dumps(forged), encoding="utf-8")
         assert "lacks or garbles" in complaint(model)
 

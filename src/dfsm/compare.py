@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
+from dfsm.bundle import MANIFEST
 from dfsm.derivatives import state_names
 from dfsm.errors import DfsmError
 from dfsm.files import check_file, json_value, write_json
 from dfsm.model import DFSM
 from dfsm.progress import track
-from dfsm.storage import MANIFEST, check_target, load, save
+from dfsm.storage import check_target, load, save
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.trial import Candidate, Course, Outcome, try_out
 from dfsm.workers import default_jobs, work_through

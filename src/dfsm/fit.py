@@ -118,12 +118,13 @@ def fit(
     )
     if choices.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
-    seen = samples
+    recorded = seen = samples
     if refinement is not None:
         with _timed(seconds, "refinement"):
             window = {"start": choices.start, "stop": choices.stop}
             model = refine(model, data, refinement, **window, seed=choices.seed).model
-            seen = along_rollouts(model, data, samples, choices)
+            recorded = with_latents(model, data, samples, choices)
+            seen = along_rollouts(model, data, recorded, choices)
     with _timed(seconds, "outputs"):
         g = _fit_outputs(seen, choices)
         e_g = correct(seen, _output_inputs(seen), seen.outputs, g, choices) if g else None
@@ -134,7 +135,7 @@ def fit(
         corrected_outputs=e_g.rows if e_g else (),
     )
     with _timed(seconds, "checks"):
-        notes, checks = _check(model, samples, data, choices)
+        notes, checks = _check(model, recorded, data, choices)
     notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
     checks = [*f.notes, *checks]
     nonlinear = None
@@ -287,7 +288,7 @@ def _check(
 ) -> tuple[list[str], list[str]]:
     """Look for what would surprise a user: non-finite values, instability, leaking disturbances."""
     notes = data_warnings(data, choices)
-    x, u, w, p = model.split(with_latents(model, data, samples, choices).inputs)
+    x, u, w, p = model.split(samples.inputs)
     values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
     if not np.isfinite(values).all():
         raise DfsmError(

@@ -233,8 +233,7 @@ def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = n
 
 def clip_range(model: DFSM, bound: float) -> tuple[jax.Array, jax.Array]:
     """Lowest and highest states within `bound` training half-ranges of the range's middle."""
-    n_uw = len(model.signals.driving)
-    columns = slice(n_uw, n_uw + len(model.signals.states))
+    columns = model.signals.state_columns
     low, high = model.region.low[columns], model.region.high[columns]
     middle, reach = (low + high) / 2, (high - low) / 2 * bound
     return middle - reach, middle + reach
@@ -317,8 +316,7 @@ def _adapt(
     import diffrax
 
     path = diffrax.LinearInterpolation(jnp.asarray(time), jnp.asarray(inputs))
-    n_uw = len(model.signals.driving)
-    spread = model.region.std[n_uw : n_uw + len(model.signals.states)]
+    spread = model.region.std[model.signals.state_columns]
     spread = jnp.where(spread > 0, spread, 1.0)
     term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, path.evaluate(t)) / spread)
     samples = jnp.asarray(time[:: 2 * every])

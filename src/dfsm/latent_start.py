@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.latents import Poles, add_latents, as_states, evolve
+from dfsm.latents import Poles, add_latents, as_states
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.rollout_error import Record
@@ -22,7 +22,7 @@ _SLOWEST, _FASTEST = 30.0, 7.0
 _RIDGE = 1e-2
 
 
-def start_latents(model: DFSM, records: Sequence[Record], count: int) -> DFSM:
+def start_latents(model: DFSM, records: Sequence[Record], count: int, spread: Array) -> DFSM:
     """Add latent states that explain some of what the model's derivatives leave over.
 
     Parameters
@@ -33,6 +33,8 @@ def start_latents(model: DFSM, records: Sequence[Record], count: int) -> DFSM:
         Training runs.
     count
         How many, an even number: they come in damped pairs.
+    spread
+        Typical size of the observed states' derivatives, shape ``(state,)``.
 
     Returns
     -------
@@ -43,7 +45,6 @@ def start_latents(model: DFSM, records: Sequence[Record], count: int) -> DFSM:
     pairs, n_uw = count // 2, len(s.driving)
     longest = max((len(r.states) - 1) * r.step for r in records)
     decay = np.geomspace(_SLOWEST / longest, 1 / (_FASTEST * records[0].step), pairs)
-    spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in records], axis=0))
     rows = list(Parametrisation.of(model, spread).rows)
     left = np.concatenate([_left_over(model, r)[:, rows] / spread[rows] for r in records])
 
@@ -52,16 +53,16 @@ def start_latents(model: DFSM, records: Sequence[Record], count: int) -> DFSM:
     drive = np.tile(np.diag(1 / std), (pairs, 1)) * each[:, None]
     middle = np.asarray(region.mean)[:n_uw]
     filters = _poles(each, drive, middle)
-    filtered = np.concatenate([_paths(filters, r)[r.before :] for r in records])
+    filtered = np.concatenate([r.follow(filters)[r.before :] for r in records])
     coefficients = _regress(filtered, left).reshape(len(rows), pairs, n_uw)
     drives = np.empty((pairs, n_uw), dtype=complex)
     for k in range(pairs):
         best = np.linalg.svd(coefficients[:, k], full_matrices=False)[2][0]
         drives[k] = best * decay[k] / std
-    paths = np.concatenate([_paths(_poles(decay, drives, middle), r) for r in records])
+    paths = np.concatenate([r.follow(_poles(decay, drives, middle)) for r in records])
     drives /= np.sqrt(np.mean(np.abs(paths) ** 2, axis=0) / 2)[:, None]
     found = _poles(decay, drives, middle)
-    pairs_along = [_paths(found, r)[r.before :] for r in records]
+    pairs_along = [r.follow(found)[r.before :] for r in records]
     c = _regress(np.concatenate(pairs_along), left)
     coupling = np.zeros((len(s.states), count))
     # Re(c ζ) in terms of the real states Re ζ and Im ζ.
@@ -75,12 +76,6 @@ def _poles(decay: Array, drive: Array, middle: Array) -> Poles:
     """Poles at 45 degrees, at rest under the mean inputs."""
     b = jnp.asarray(drive, dtype=complex)
     return Poles(jnp.asarray(decay), jnp.asarray(decay), b, -b @ middle)
-
-
-def _paths(found: Poles, record: Record) -> Array:
-    h = jnp.full(len(record.inputs) // 2, record.step)
-    v = jnp.asarray(record.inputs[::2, : len(record.rest)])
-    return np.asarray(evolve(found, h, v, jnp.asarray(record.rest)))
 
 
 def _left_over(model: DFSM, record: Record) -> Array:

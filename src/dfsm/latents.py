@@ -25,7 +25,7 @@ from dfsm.linear import LinearModel
 from dfsm.model import DFSM
 from dfsm.signals import Region
 from dfsm.trajectory import Channel, Trajectory
-from dfsm.types import Array
+from dfsm.types import Array, IntArray
 
 # Before the record begins, the inputs are taken to have been what they were on average over this.
 _REST = 20.0  # s
@@ -54,9 +54,7 @@ class Poles(NamedTuple):
 
 def poles(model: DFSM) -> Poles:
     """Dynamics of a model's latent pairs."""
-    n_uw, n = len(model.signals.driving), len(model.signals.states)
-    first = n - len(model.signals.latents)
-    even, odd = np.arange(first, n, 2), np.arange(first + 1, n, 2)
+    n_uw, even, odd = _rows(model)
     L, b = model.f.coefficients[0], model.f.offsets[0]
     return Poles(
         -L[even, n_uw + even],
@@ -68,9 +66,7 @@ def poles(model: DFSM) -> Poles:
 
 def with_poles(model: DFSM, found: Poles) -> DFSM:
     """The model with other dynamics of its latent pairs; JAX can follow it."""
-    n_uw, n = len(model.signals.driving), len(model.signals.states)
-    first = n - len(model.signals.latents)
-    even, odd = np.arange(first, n, 2), np.arange(first + 1, n, 2)
+    n_uw, even, odd = _rows(model)
     L, b = model.f.coefficients, model.f.offsets
     for rows, others, sign, part in ((even, odd, 1.0, jnp.real), (odd, even, -1.0, jnp.imag)):
         L = L.at[:, rows, n_uw + rows].set(-found.decay)
@@ -78,6 +74,13 @@ def with_poles(model: DFSM, found: Poles) -> DFSM:
         L = L.at[:, rows, :n_uw].set(part(found.drive))
         b = b.at[:, rows].set(part(found.offset))
     return replace(model, f=replace(model.f, coefficients=L, offsets=b))
+
+
+def _rows(model: DFSM) -> tuple[int, IntArray, IntArray]:
+    """Number of inputs that drive the pairs, and the rows of their real and imaginary parts."""
+    s = model.signals
+    first, last = len(s.observed), len(s.states)
+    return len(s.driving), np.arange(first, last, 2), np.arange(first + 1, last, 2)
 
 
 def evolve(found: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Array:
@@ -181,7 +184,7 @@ def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Arra
         Their values along the training runs, each ``(time, 2 pair)``.
     """
     s, count = model.signals, coupling.shape[1]
-    at, n = len(s.driving) + len(s.states), len(s.states)
+    at, n = s.state_columns.stop, len(s.states)
 
     def wider(linear: LinearModel, extra_rows: int) -> LinearModel:
         L = jnp.insert(linear.coefficients, np.full(count, at), 0.0, axis=2)
@@ -210,7 +213,7 @@ def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Arra
 def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
     """The model with the training range of its latent states taken from their paths."""
     s = model.signals
-    at = len(s.driving) + len(s.states) - len(s.latents)
+    at = s.observed_columns.stop
     return replace(model, region=_with_range(model.region, at, len(s.latents), paths))
 
 

@@ -207,8 +207,8 @@ class DFSM(eqx.Module):
         inputs = self.join(states, controls, disturbances, parameters)
         if inputs.ndim != 1:
             raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
-        n_uw = len(self.signals.driving)
-        xs, us = slice(n_uw, n_uw + len(self.signals.states)), slice(0, n_uw)
+        xs = self.signals.state_columns
+        us = slice(0, xs.start)
         J = np.asarray(_jacobian(self, _derivative, inputs))
         extra = jnp.zeros(2 if self.signals.azimuth else 0)
         G = (
@@ -256,8 +256,7 @@ class DFSM(eqx.Module):
         list
             Pairs of schedule value and complex eigenvalues, most unstable first.
         """
-        n_uw = len(self.signals.driving)
-        A = np.asarray(self.f.coefficients)[:, :, n_uw : n_uw + len(self.signals.states)]
+        A = np.asarray(self.f.coefficients)[:, :, self.signals.state_columns]
         pairs = []
         for point, matrix in zip(np.asarray(self.f.grid), A, strict=True):
             values = np.linalg.eigvals(matrix).astype(np.complex128)

@@ -54,7 +54,7 @@ class Parametrisation(eqx.Module):
         L = np.asarray(model.f.coefficients)[:, list(rows)]
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
         # Nothing is known yet about states that have only been added.
-        varies[len(s.driving) + len(s.observed) :] |= np.array(
+        varies[s.observed_columns.stop :] |= np.array(
             [c in s.latents for c in (*s.latents, *s.parameters)], dtype=bool
         )
         scheduled, constant = (tuple(np.flatnonzero(v).tolist()) for v in (varies, ~varies))

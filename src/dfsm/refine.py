@@ -26,7 +26,7 @@ import numpy as np
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.latent_start import start_latents
-from dfsm.latents import with_latent_range
+from dfsm.latents import as_states, poles, with_latent_range
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.progress import track
@@ -171,7 +171,7 @@ def refine(
     at = np.zeros(parameters.size)
     before = after = final.relative(at)
     if choices.latents and not model.signals.latents:
-        with_latents = start_latents(model, train, choices.latents)
+        with_latents = start_latents(model, train, choices.latents, spread)
         parameters = Parametrisation.of(with_latents, spread)
         final = RolloutError(parameters, held, choices.windows[-1], weights)
         at = np.zeros(parameters.size)
@@ -187,7 +187,10 @@ def refine(
             best, after = at, error
     refined = parameters.at(jnp.asarray(best))
     if refined.signals.latents:
-        refined = with_latent_range(refined, [r.latent_path(refined)[r.before :] for r in train])
+        paths = [
+            np.asarray(as_states(jnp.asarray(r.follow(poles(refined)))))[r.before :] for r in train
+        ]
+        refined = with_latent_range(refined, paths)
     names = {"training": [r.name for r in training], "validation": [r.name for r in validation]}
     return _result(model, refined, (before, after), history, names)
 
@@ -205,8 +208,7 @@ def _weights(model: DFSM, choices: RefineSettings) -> Array:
 
 def _stability_kept(parameters: Parametrisation) -> Callable[[Array], bool]:
     """Whether a model is stable at all schedule values; always true if the start is not."""
-    s = parameters.model.signals
-    columns = slice(len(s.driving), len(s.driving) + len(s.states))
+    columns = parameters.model.signals.state_columns
     if fastest_growth(parameters.model.f, columns) > 0:
         return lambda _: True
     return lambda at: fastest_growth(parameters.at(jnp.asarray(at)).f, columns) <= 0

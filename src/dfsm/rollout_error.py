@@ -25,7 +25,7 @@ import numpy as np
 from dfsm.derivatives import differentiate
 from dfsm.filters import moving_average
 from dfsm.integrate import clip_range, exogenous_groups, rate, rk4
-from dfsm.latents import as_states, evolve, poles, rest
+from dfsm.latents import Poles, as_states, evolve, poles, rest
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.signals import with_computed
@@ -63,11 +63,11 @@ class Record:
     inputs: Array
     rest: Array
 
-    def latent_path(self, model: DFSM) -> Array:
-        """Latent states from the start of the record on, ``(before + step + 1, latent)``."""
+    def follow(self, found: Poles) -> Array:
+        """Latent pairs from the start of the record on, complex, ``(before + step + 1, pair)``."""
         h = jnp.full(len(self.inputs) // 2, self.step)
         v = jnp.asarray(self.inputs[::2, : len(self.rest)])
-        return np.asarray(as_states(evolve(poles(model), h, v, jnp.asarray(self.rest))))
+        return np.asarray(evolve(found, h, v, jnp.asarray(self.rest)))
 
 
 def record_of(

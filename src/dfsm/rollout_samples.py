@@ -27,7 +27,7 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, choices: FitSetti
     for run in data:
         inside = np.isin(run.time, run.window(choices.start, choices.stop).time)
         paths.append(latent_path(model, run)[inside])
-    at = len(model.signals.driving) + len(model.signals.observed)
+    at = model.signals.observed_columns.stop
     inputs = np.insert(samples.inputs, [at] * len(model.signals.latents), np.concatenate(paths), 1)
     return replace(samples, inputs=inputs, signals=model.signals)
 
@@ -35,18 +35,16 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, choices: FitSetti
 def along_rollouts(model: DFSM, data: Dataset, samples: Samples, choices: FitSettings) -> Samples:
     """Samples whose states are those of the model's rollouts of the training runs.
 
-    A run whose rollout ends early keeps its recorded states.
+    A run whose rollout ends early keeps its recorded states. `samples` come from `with_latents`.
     """
-    samples = with_latents(model, data, samples, choices)
     # Its outputs are what is going to be fitted.
     model = replace(model, signals=replace(model.signals, outputs=()))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DfsmWarning)
         found = simulate(model, list(data), start=choices.start, stop=choices.stop)
     inputs = samples.inputs.copy()
-    first = len(model.signals.driving)
     names = model.signals.names("states")
-    columns = slice(first, first + len(names))
+    columns = model.signals.state_columns
     for k, rollout in enumerate(found):
         if rollout.status is Status.COMPLETED:
             inputs[samples.runs == k, columns] = rollout.trajectory.select(names).values

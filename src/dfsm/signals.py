@@ -9,7 +9,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from numpy.typing import ArrayLike
 
 import dfsm.jax_setup  # noqa: F401
@@ -19,9 +18,7 @@ from dfsm.features import Feature, with_features
 from dfsm.read.wind import CORRECTED_WIND, undisturbed_rotor_wind
 from dfsm.settings import require, settings
 from dfsm.trajectory import Channel, Trajectory
-
-# Radians per second in one unit of a rotor or generator speed.
-_SPEED_UNITS = {"rpm": np.pi / 30, "rad/s": 1.0, "deg/s": np.pi / 180}
+from dfsm.units import SPEEDS
 
 
 @settings
@@ -100,6 +97,17 @@ class SignalTable:
     def driving(self) -> tuple[str, ...]:
         """Names of controls and disturbances, the columns of B."""
         return tuple(c.name for c in (*self.controls, *self.disturbances))
+
+    @property
+    def state_columns(self) -> slice:
+        """Where the states stand in I."""
+        first = len(self.controls) + len(self.disturbances)
+        return slice(first, first + len(self.states))
+
+    @property
+    def observed_columns(self) -> slice:
+        """Where the states that a recorded run holds stand in I."""
+        return slice(self.state_columns.start, self.state_columns.stop - len(self.latents))
 
     @property
     def exogenous(self) -> tuple[str, ...]:
@@ -182,12 +190,12 @@ def radians_per_second(speed: Channel) -> float:
     DfsmError
         The unit is not one of a rotational speed.
     """
-    if speed.unit not in _SPEED_UNITS:
+    if speed.unit not in SPEEDS:
         raise DfsmError(
             f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of "
-            f"{', '.join(_SPEED_UNITS)}"
+            f"{', '.join(SPEEDS)}"
         )
-    return _SPEED_UNITS[speed.unit]
+    return SPEEDS[speed.unit]
 
 
 class Region(eqx.Module):

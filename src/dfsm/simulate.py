@@ -254,7 +254,7 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
 def _given(model: DFSM, initial: ArrayLike, runs: int) -> Array:
     """Initial states of every run as given, ``(run, state)``, with the latent ones or without."""
     given, s = np.asarray(initial, dtype=np.float64), model.signals
-    lengths = {len(s.states): None, len(s.observed): None}
+    lengths = (len(s.states), len(s.observed)) if s.latents else (len(s.states),)
     shapes = [shape for n in lengths for shape in ((n,), (runs, n))]
     if given.shape not in shapes:
         raise DfsmError(
@@ -309,8 +309,7 @@ def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
 
 def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) -> Simulation:
     s = model.signals
-    n_uw = len(s.driving)
-    columns = slice(n_uw, n_uw + len(s.states))
+    columns = s.state_columns
     low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
     middle, half = (low + high) / 2, (high - low) / 2
     x = rollout.states

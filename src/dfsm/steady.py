@@ -77,8 +77,7 @@ def steady_state(
     u = u if controls is None else jnp.asarray(controls, dtype=float)
     w = w if disturbances is None else jnp.asarray(disturbances, dtype=float)
     p = p if parameters is None else jnp.asarray(parameters, dtype=float)
-    n_uw = len(model.signals.driving)
-    scale = model.region.std[n_uw : n_uw + x.size]
+    scale = model.region.std[model.signals.state_columns]
 
     def residual(z: jax.Array) -> jax.Array:
         return model.derivative(x + scale * z, u, w, p) / scale

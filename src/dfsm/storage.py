@@ -6,8 +6,6 @@ predicts bit for bit the same after it has been saved and loaded.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,21 +14,20 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
 
-import dfsm
+from dfsm.bundle import MANIFEST, Bundle
 from dfsm.corrective import Corrective, GaussianUnits, Perceptron
 from dfsm.errors import DfsmError
-from dfsm.files import check_folder, json_bytes, json_value, write_folder
+from dfsm.files import check_folder
 from dfsm.linear import LinearModel
 from dfsm.model import DFSM
 from dfsm.signals import Provenance, Region, SignalTable
 from dfsm.types import Array
 
 FORMAT = 1
-MANIFEST, TENSORS = "manifest.json", "model.safetensors"
+TENSORS = "model.safetensors"
 MULTI_FIDELITY, NONLINEAR = "multi-fidelity", "nonlinear-only"
+_BUNDLE = Bundle(TENSORS, FORMAT, "fit the model again")
 
 
 def save(model: DFSM, path: str | Path, nonlinear: DFSM | None = None) -> None:
@@ -53,18 +50,12 @@ def save(model: DFSM, path: str | Path, nonlinear: DFSM | None = None) -> None:
     models = {MULTI_FIDELITY: model} | ({NONLINEAR: nonlinear} if nonlinear is not None else {})
     tensors: dict[str, Array] = {}
     structure = {name: _take_apart(m, name, tensors) for name, m in models.items()}
-    with write_folder(path, is_ours=_is_model) as folder:
-        save_file(tensors, folder / TENSORS)
-        manifest = {
-            "format": FORMAT,
-            "dfsm": dfsm.__version__,
-            "sha256": hashlib.sha256((folder / TENSORS).read_bytes()).hexdigest(),
-            "signals": asdict(model.signals),
-            "models": structure,
-            "provenance": dict(model.provenance.record),
-        }
-        manifest["checksum"] = _checksum(manifest)
-        (folder / MANIFEST).write_bytes(json_bytes(manifest))
+    content = {
+        "signals": asdict(model.signals),
+        "models": structure,
+        "provenance": dict(model.provenance.record),
+    }
+    _BUNDLE.write(path, tensors, content, _is_model)
 
 
 def check_target(path: str | Path) -> None:
@@ -93,7 +84,7 @@ def load_all(path: str | Path) -> dict[str, DFSM]:
     """Read all models of a model folder by name: multi-fidelity, and nonlinear-only if kept."""
     path = Path(path)
     manifest = _read_manifest(path)
-    tensors = _read_tensors(path, manifest)
+    tensors = _BUNDLE.read_tensors(path, manifest)
     try:
         signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
         provenance = Provenance(manifest["provenance"])
@@ -102,7 +93,9 @@ def load_all(path: str | Path) -> dict[str, DFSM]:
             for name, structure in manifest["models"].items()
         }
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
-        raise _damaged(path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]) from None
+        raise _BUNDLE.damaged(
+            path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]
+        ) from None
 
 
 # -- taking apart and putting together ----------------------------------------------------------
@@ -202,48 +195,10 @@ def _is_model(path: Path) -> bool:
     return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
 
 
-def _checksum(manifest: Mapping[str, Any]) -> str:
-    """Digest of all that a manifest says, however its JSON is laid out."""
-    said = {k: v for k, v in manifest.items() if k != "checksum"}
-    return hashlib.sha256(json.dumps(json_value(said), sort_keys=True).encode()).hexdigest()
-
-
-def _damaged(path: Path, what: str) -> DfsmError:
-    return DfsmError(f"{path} is damaged: {what}; fit the model again or restore the folder")
-
-
 def _read_manifest(path: Path) -> dict[str, Any]:
     if not path.is_dir():
         kind = "a file" if path.exists() else "missing"
         raise DfsmError(f"{path} is {kind}; a model folder as 'dfsm fit' writes it was expected")
-    try:
-        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DfsmError(f"{path} holds no {MANIFEST}, so it is not a model folder") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise _damaged(path, f"{MANIFEST} cannot be read ({error})") from None
-    version = manifest.get("format") if isinstance(manifest, dict) else None
-    if not isinstance(version, int):
-        raise _damaged(path, f"{MANIFEST} states no format number")
-    if version > FORMAT:
-        raise DfsmError(
-            f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to {FORMAT}: "
-            "upgrade with pip install -U dfsm"
-        )
-    if manifest.get("checksum") != _checksum(manifest):
-        raise _damaged(path, f"{MANIFEST} is not as it was written")
-    return manifest
-
-
-def _read_tensors(path: Path, manifest: Mapping[str, Any]) -> dict[str, Array]:
-    file = path / TENSORS
-    try:
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise _damaged(path, f"{TENSORS} cannot be read ({error.strerror})") from None
-    if digest != manifest.get("sha256"):
-        raise _damaged(path, f"{TENSORS} is not the file that {MANIFEST} was written for")
-    try:
-        return load_file(file)
-    except SafetensorError as error:
-        raise _damaged(path, f"{TENSORS} cannot be read ({error})") from None
+    if not (path / MANIFEST).exists():
+        raise DfsmError(f"{path} holds no {MANIFEST}, so it is not a model folder")
+    return _BUNDLE.read_manifest(path)

@@ -8,7 +8,7 @@ import numpy as np
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 TORQUES = {"Nm": 1.0, "kNm": 1e3, "MNm": 1e6}
 POWERS = {"W": 1e-3, "kW": 1.0, "MW": 1e3}
-SPEEDS = {"rad/s": 1.0, "rpm": np.pi / 30}
+SPEEDS = {"rpm": np.pi / 30, "rad/s": 1.0, "deg/s": np.pi / 180}
 
 
 def plain(unit: str) -> str:

@@ -12,6 +12,7 @@ from dfsm.control.guess import Start
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.program import Rows
 from dfsm.errors import DfsmError
+from dfsm.trajectory import Channel, Trajectory
 from dfsm.types import Array, IntArray
 
 # Limits from here on mean that there is none.
@@ -152,6 +153,14 @@ class Layout:
         if self.problem.free_time is not None:
             low[q[-1]], high[q[-1]] = self.problem.free_time
         return np.where(low <= -_NONE, -np.inf, low), np.where(high >= _NONE, np.inf, high)
+
+    def costates(self, tau: Array, values: Array) -> tuple[Trajectory, ...]:
+        """Values at normalised times as trajectories, from ``(scenario, time, state)``."""
+        if len(tau) == 1:  # a trajectory has two samples
+            tau, values = np.array([0.0, 1.0]), np.repeat(values, 2, axis=1)
+        time = self.problem.start + tau * (self.start.stop - self.problem.start)
+        channels = tuple(Channel(c.name) for c in self.problem.plant.channels["states"])
+        return tuple(Trajectory(time, v, channels, name="costates") for v in values)
 
     def channel_limits(self, name: str, time: Array) -> tuple[Array, Array]:
         """Bounds of a state or control at times in s, the training range included if asked."""

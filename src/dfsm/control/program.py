@@ -111,6 +111,10 @@ class Program:
         """Variables in the model's units."""
         return z * self.scale
 
+    def scaled(self, values: Array) -> Array:
+        """The solver's variables from values in the model's units, moved within their bounds."""
+        return np.clip(values / self.scale, self.lower, self.upper)
+
     # -- structure ------------------------------------------------------------------------------
 
     def _jacobian_structure(self) -> None:

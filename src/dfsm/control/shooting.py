@@ -23,7 +23,7 @@ from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.program import Block, Program, Rows
 from dfsm.control.transcription import node_data
 from dfsm.settings import require, settings
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.trajectory import Trajectory
 from dfsm.types import Array, IntArray
 
 
@@ -141,8 +141,7 @@ class Shooting:
 
     def scaled(self, start: Start) -> Array:
         """The solver's variables at given values, moved within their bounds."""
-        p = self.program
-        return np.clip(self.layout.pack(start) / p.scale, p.lower, p.upper)
+        return self.program.scaled(self.layout.pack(start))
 
     def unscaled(self, z: Array) -> Start:
         """Values at the nodes; states inside the segments are the integrator's."""
@@ -164,11 +163,7 @@ class Shooting:
         shape = (self.layout.scenarios, self.method.segments, self.functions.nx)
         values = -multipliers[: int(np.prod(shape))].reshape(shape)
         tau = np.linspace(0, 1, self.method.segments + 1)[1:]
-        if len(tau) == 1:
-            tau, values = np.array([0.0, 1.0]), np.repeat(values, 2, axis=1)
-        time = self.problem.start + tau * (self.layout.time[-1] - self.problem.start)
-        channels = tuple(Channel(c.name) for c in self.problem.plant.channels["states"])
-        return tuple(Trajectory(time, v, channels, name="costates") for v in values)
+        return self.layout.costates(tau, values)
 
     # -- program --------------------------------------------------------------------------------
 

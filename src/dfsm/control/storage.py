@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,21 +9,20 @@ from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
 
-import dfsm
+from dfsm.bundle import MANIFEST, Bundle
 from dfsm.control.grid import Grid
 from dfsm.control.solution import Ending, Replay, Solution
 from dfsm.errors import DfsmError
-from dfsm.files import check_folder, json_bytes, write_folder
+from dfsm.files import check_folder
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.types import Array
 
 FORMAT = 1
-MANIFEST, TENSORS = "manifest.json", "solution.safetensors"
+TENSORS = "solution.safetensors"
 # A page about the solution, which `dfsm optimize` puts beside them.
 PAGE = "solution.html"
+_BUNDLE = Bundle(TENSORS, FORMAT, "solve again")
 # What the manifest holds as it is.
 _PLAIN = (
     "name",
@@ -66,9 +63,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
     for group in ("multipliers", "bounds"):
         found = getattr(solution, group)
         tensors |= {f"{group}/{n}": np.asarray(v) for n, v in found.items()}
-    manifest: dict[str, Any] = {"format": FORMAT, "dfsm": dfsm.__version__}
-    manifest |= {key: getattr(solution, key) for key in _PLAIN}
-    manifest |= {
+    content = {key: getattr(solution, key) for key in _PLAIN}
+    content |= {
         "ending": solution.ending.name,
         "scheme": {"kind": solution.grid.kind, "degree": solution.grid.degree},
         "trajectories": _apart("trajectories", solution.trajectories, tensors),
@@ -76,10 +72,7 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "replays": _apart("replays", [r.trajectory for r in solution.replays], tensors),
         "deviations": [[dict(r.deviation), r.relative] for r in solution.replays],
     }
-    with write_folder(path, is_ours=_is_solution) as folder:
-        save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, folder / TENSORS)
-        manifest["sha256"] = hashlib.sha256((folder / TENSORS).read_bytes()).hexdigest()
-        (folder / MANIFEST).write_bytes(json_bytes(manifest))
+    _BUNDLE.write(path, tensors, content, _is_solution)
 
 
 def check_solution_target(path: str | Path) -> None:
@@ -101,7 +94,10 @@ def load_solution(path: str | Path) -> Solution:
         The folder is missing, no solution, damaged, or written by a newer version.
     """
     path = Path(path)
-    manifest, tensors = _read(path)
+    if not path.is_dir() or not _is_solution(path):
+        raise DfsmError(f"{path} is no folder of a solution as save_solution makes it")
+    manifest = _BUNDLE.read_manifest(path)
+    tensors = _BUNDLE.read_tensors(path, manifest)
     try:
         plain = {key: manifest[key] for key in _PLAIN}
         # JSON has no NaN: a shooting method has no local error.
@@ -124,7 +120,9 @@ def load_solution(path: str | Path) -> Solution:
             solver_state=tensors["solver_state"],
         )
     except (KeyError, TypeError, ValueError, ValidationError) as error:
-        raise _damaged(path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]) from None
+        raise _BUNDLE.damaged(
+            path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]
+        ) from None
 
 
 def _apart(
@@ -157,31 +155,3 @@ def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
 
 def _is_solution(path: Path) -> bool:
     return {p.name for p in path.iterdir()} - {PAGE} == {MANIFEST, TENSORS}
-
-
-def _damaged(path: Path, what: str) -> DfsmError:
-    return DfsmError(f"{path} is damaged: {what}; solve again or restore the folder")
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
-    if not path.is_dir() or not _is_solution(path):
-        raise DfsmError(f"{path} is no folder of a solution as save_solution makes it")
-    try:
-        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-        digest = hashlib.sha256((path / TENSORS).read_bytes()).hexdigest()
-    except (OSError, ValueError, RecursionError) as error:
-        raise _damaged(path, f"it cannot be read ({error})") from None
-    version = manifest.get("format") if isinstance(manifest, dict) else None
-    if not isinstance(version, int):
-        raise _damaged(path, f"{MANIFEST} states no format number")
-    if version > FORMAT:
-        raise DfsmError(
-            f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to {FORMAT}: "
-            "upgrade with pip install -U dfsm"
-        )
-    if digest != manifest.get("sha256"):
-        raise _damaged(path, f"{TENSORS} is not the file that {MANIFEST} was written for")
-    try:
-        return manifest, load_file(path / TENSORS)
-    except SafetensorError as error:
-        raise _damaged(path, f"{TENSORS} cannot be read ({error})") from None

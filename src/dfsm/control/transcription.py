@@ -22,7 +22,7 @@ from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.program import Block, Program
 from dfsm.control.schemes import Kind
 from dfsm.settings import require, settings
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 
 
@@ -143,8 +143,7 @@ class Transcription:
 
     def scaled(self, start: Start) -> Array:
         """The solver's variables at given values, moved within their bounds."""
-        p = self.program
-        return np.clip(self.layout.pack(start) / p.scale, p.lower, p.upper)
+        return self.program.scaled(self.layout.pack(start))
 
     def unscaled(self, z: Array) -> Start:
         """Values at the nodes; a control that is not a variable is extrapolated within bounds."""
@@ -173,12 +172,7 @@ class Transcription:
         else:
             values, tau = values[:, :, -1:], grid.edges[:-1] + grid.lengths / 2
         values = values.reshape(layout.scenarios, -1, self.functions.nx)
-        if len(tau) == 1:
-            tau, values = np.array([0.0, 1.0]), np.repeat(values, 2, axis=1)
-        channels = [Channel(c.name) for c in self.problem.plant.channels["states"]]
-        duration = layout.start.stop - self.problem.start
-        time = self.problem.start + tau * duration
-        return tuple(Trajectory(time, v, tuple(channels), name="costates") for v in values)
+        return layout.costates(tau, values)
 
     def slopes(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
         """State derivatives with normalised time, for states and controls at given times.
