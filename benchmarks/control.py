@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.casadi_expressions import solve_with_expressions
 from benchmarks.known_problems import PROBLEMS
 from dfsm.control import (
     DirectTranscription,
@@ -40,16 +41,22 @@ SHOT = ("Hager1", "Vanderpol", "Brachistochrone", "HagerHouRao1", "TwoLinkRobot,
 
 
 def run() -> dict[str, Any]:
-    """Measure all three.
+    """Measure all four.
 
     Returns
     -------
     dict
         ``known``: per problem and method the objective, its relative error, iterations and
         seconds to solve; ``orders``: per smooth problem and scheme the errors on 5 to 40 intervals;
-        ``turbine``: per number of points the iterations and milliseconds per iteration.
+        ``turbine``: per number of points the iterations and milliseconds per iteration;
+        ``expressions``: the same program in CasADi expressions, with times and objectives.
     """
-    return {"known": known(), "orders": orders(), "turbine": turbine_times()}
+    return {
+        "known": known(),
+        "orders": orders(),
+        "turbine": turbine_times(),
+        "expressions": against_expressions(),
+    }
 
 
 def known() -> dict[str, Any]:
@@ -101,6 +108,30 @@ def orders(meshes: tuple[int, ...] = (5, 10, 20, 40)) -> dict[str, Any]:
                 "orders": [float(v) for v in shown],
             }
     return found
+
+
+def against_expressions(points: int = 1000) -> dict[str, Any]:
+    """The same nonlinear program by dfsm and in CasADi expressions, one after the other.
+
+    dfsm a second time: with compiled code, from the start that it chooses itself and from its
+    solution.
+    """
+    problem = turbine()
+    method = DirectTranscription(scheme="trapezoidal", mesh=points - 1, refine=None, tolerance=1e-7)
+    first = solve(problem, method, simulate=False)
+    again = solve(problem, method, simulate=False)
+    warm = solve(problem, method, first, simulate=False)
+    other = solve_with_expressions(problem, points)
+    ours = again.seconds["solve"] / again.iterations
+    theirs = other["seconds_solve"] / other["iterations"]
+    return {
+        "dfsm": _figures(first, other["objective"]),
+        "dfsm, compiled": _figures(again, other["objective"]),
+        "dfsm, warm start": _figures(warm, other["objective"]),
+        "casadi": other,
+        "ms_per_iteration": {"dfsm": 1e3 * ours, "casadi": 1e3 * theirs},
+        "casadi_over_dfsm": theirs / ours,
+    }
 
 
 def turbine_times(points: tuple[int, ...] = POINTS) -> dict[str, Any]:
