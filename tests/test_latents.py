@@ -17,7 +17,7 @@ from dfsm.fit import fit
 from dfsm.latents import Poles, as_states, evolve, latent_path, poles
 from dfsm.linear import LPV, LTI, fit_linear
 from dfsm.parametrise import Parametrisation
-from dfsm.refine import RefineSettings
+from dfsm.refine import RefineSettings, refine
 from dfsm.rollout_error import RolloutError, record_of
 from dfsm.samples import FitSettings
 from dfsm.simulate import Status, initial_state, simulate
@@ -191,7 +191,10 @@ def test_slopes_written_out_are_those_of_the_model(model, kind):
         point = jnp.asarray(rng.normal(size=inputs))
         x, u, w, p = full.split(point)
         slopes = jax.jacfwd(lambda t, x=x, u=u, w=w, p=p: parameters.at(t).derivative(x, u, w, p))
-        found = parameters.slopes(at, parameters.at(at), point)
+        there = parameters.at(at)
+        found = np.zeros((3, parameters.size))
+        found[:1] = parameters.slopes(at, there, point)
+        found[1:, parameters.latent_columns[0]] = parameters.latent_slopes(there, point)[0]
         np.testing.assert_allclose(found, slopes(at), rtol=1e-9, atol=1e-12)
 
 
@@ -234,6 +237,58 @@ def test_constant_coefficients(runs):
     assert np.ptp(L[:, 0, 1]) > 0
     with pytest.raises(DfsmError, match=r"linear\.constant names 'torque', which is not an input"):
         fit(runs, replace(choices, linear=LPV(schedule="w", constant=("torque",))))
+
+
+@pytest.mark.parametrize("linear", [LTI(), LPV(schedule="w", points=3)])
+def test_known_coefficients(runs, linear, tmp_path):
+    linear = replace(linear, known={"q": {"u": 0.125}}, margin=0.05)
+    choices = replace(SETTINGS, linear=linear)
+    brief = replace(REFINEMENT, windows=(5.0,), iterations=2)
+    for refinement in (None, brief):
+        model = fit(runs, choices, refinement).model
+        L = np.asarray(model.f.coefficients)
+        assert (L[:, 0, 0] == 0.125).all()
+        assert model.g is not None
+        assert not (np.asarray(model.g.coefficients)[:, 0, 0] == 0.125).any()
+        save(model, tmp_path / "model")
+        assert load(tmp_path / "model").f.known == ((0, 0),)
+
+
+def test_the_others_are_fitted_to_what_known_coefficients_leave():
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(3000, 3)) @ rng.normal(size=(3, 3))
+    targets = inputs @ rng.normal(size=(3, 2)) + rng.normal(size=(3000, 2))
+    known = {(1, 0): 0.7}
+    L = np.asarray(
+        fit_linear([(inputs, targets)], ["a", "b", "c"], LTI(), known=known).model.coefficients
+    )[0]
+    X = np.column_stack([inputs, np.ones(3000)])
+    free = np.linalg.lstsq(X, targets[:, 0], rcond=None)[0]
+    rest = np.linalg.lstsq(X[:, 1:], targets[:, 1] - 0.7 * inputs[:, 0], rcond=None)[0]
+    np.testing.assert_allclose(L[0], free[:3], rtol=1e-9)
+    np.testing.assert_allclose(L[1], [0.7, *rest[:2]], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ({"speed": {"u": 1.0}}, r"linear\.known names 'speed', which is not a state; "),
+        ({"q": {"q": 1.0}}, r"linear\.known\.q names 'q', which is no control or disturbance; "),
+    ],
+)
+def test_known_coefficients_of_what_there_is_not(runs, known, said):
+    with pytest.raises(DfsmError, match=said):
+        fit(runs, replace(SETTINGS, linear=LTI(known=known)))
+
+
+def test_only_chosen_inputs_drive_them(runs, plain):
+    choices = replace(REFINEMENT, latent_inputs=("w",), windows=(5.0,), iterations=2)
+    model = refine(plain, runs, choices, start=START).model
+    drive = np.asarray(poles(model).drive)
+    assert (drive[:, 0] == 0).all()
+    assert (drive[:, 1] != 0).all()
+    with pytest.raises(DfsmError, match=r"refine\.latent_inputs names 'q', which is no control or"):
+        refine(plain, runs, replace(choices, latent_inputs=("q",)), start=START)
 
 
 def test_shared_coefficients_are_those_of_one_regression(runs):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from dfsm.correction import correct, destabilised
 from dfsm.corrective import Corrective, NoCorrection, fit_corrective
 from dfsm.derivatives import kinematic_rows
-from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning, near_matches
 from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
 from dfsm.model import DFSM
 from dfsm.refine import RefineSettings, refine
@@ -161,7 +161,8 @@ def _fit_derivatives(samples: Samples, choices: FitSettings) -> LinearFit:
     """Linear fit of ξ̇; kinematic rows d q = q̇ are written down, not fitted."""
     known = kinematic_rows(choices.states)
     fitted = [i for i in range(samples.derivatives.shape[1]) if i not in known]
-    result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], choices)
+    given = _given(samples, choices, fitted)
+    result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], choices, given)
     n_uw = len(choices.controls) + len(choices.driving)
     if choices.linear.margin is not None:
         columns = slice(n_uw, n_uw + samples.derivatives.shape[1])
@@ -179,8 +180,38 @@ def _fit_derivatives(samples: Samples, choices: FitSettings) -> LinearFit:
     rms[fitted] = result.residual_rms
     for row, rate in known.items():
         L[:, row, n_uw + rate] = 1.0
-    model = LinearModel(result.model.grid, jnp.asarray(L), jnp.asarray(b), result.model.schedule)
+    model = LinearModel(
+        result.model.grid,
+        jnp.asarray(L),
+        jnp.asarray(b),
+        result.model.schedule,
+        tuple((fitted[row], column) for row, column in result.model.known),
+    )
     return replace(result, model=model, residual_rms=rms, target_std=std)
+
+
+def _given(
+    samples: Samples, choices: FitSettings, fitted: Sequence[int]
+) -> dict[tuple[int, int], float]:
+    """``linear.known`` by fitted row and input column."""
+    s = samples.signals
+    rates = kinematic_rows(choices.states)
+    rows = {spec.name: rates.get(i, i) for i, spec in enumerate(choices.states)}
+    inputs = [c.name for c in s.inputs[: len(s.driving)]]
+    found = {}
+    for state, coefficients in choices.linear.known.items():
+        if state not in rows:
+            raise DfsmError(
+                f"linear.known names '{state}', which is not a state; " + near_matches(state, rows)
+            )
+        for name, value in coefficients.items():
+            if name not in inputs:
+                raise DfsmError(
+                    f"linear.known.{state} names '{name}', which is no control or disturbance; "
+                    + near_matches(name, inputs)
+                )
+            found[list(fitted).index(rows[state]), inputs.index(name)] = float(value)
+    return found
 
 
 def _account(
@@ -213,7 +244,13 @@ def _output_inputs(samples: Samples) -> Array:
     return np.concatenate([samples.inputs, samples.harmonics], axis=1)
 
 
-def _linear(samples: Samples, inputs: Array, targets: Array, choices: FitSettings) -> LinearFit:
+def _linear(
+    samples: Samples,
+    inputs: Array,
+    targets: Array,
+    choices: FitSettings,
+    known: Mapping[tuple[int, int], float] | None = None,
+) -> LinearFit:
     names = [c.name for c in samples.signals.inputs]
     names += ["cos(blades ψ)", "sin(blades ψ)"][: inputs.shape[1] - len(names)]
     windows = None
@@ -225,7 +262,7 @@ def _linear(samples: Samples, inputs: Array, targets: Array, choices: FitSetting
             )
         column = names.index(choices.linear.schedule)
         windows = schedule_windows(inputs[:, column], choices.linear.points)
-    return fit_linear(samples.blocks(inputs, targets), names, choices.linear, windows)
+    return fit_linear(samples.blocks(inputs, targets), names, choices.linear, windows, known)
 
 
 # -- nonlinear-only, for comparison --------------------------------------------------------------

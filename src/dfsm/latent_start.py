@@ -22,7 +22,13 @@ _SLOWEST, _FASTEST = 30.0, 7.0
 _RIDGE = 1e-2
 
 
-def start_latents(model: DFSM, records: Sequence[Record], count: int, spread: Array) -> DFSM:
+def start_latents(
+    model: DFSM,
+    records: Sequence[Record],
+    count: int,
+    spread: Array,
+    drivers: Sequence[str] | None = None,
+) -> DFSM:
     """Add latent states that explain some of what the model's derivatives leave over.
 
     Parameters
@@ -35,6 +41,8 @@ def start_latents(model: DFSM, records: Sequence[Record], count: int, spread: Ar
         How many, an even number: they come in damped pairs.
     spread
         Typical size of the observed states' derivatives, shape ``(state,)``.
+    drivers
+        Controls and disturbances that drive them; None takes all.
 
     Returns
     -------
@@ -49,16 +57,18 @@ def start_latents(model: DFSM, records: Sequence[Record], count: int, spread: Ar
     left = np.concatenate([_left_over(model, r)[:, rows] / spread[rows] for r in records])
 
     std = np.where(np.asarray(region.std)[:n_uw] > 0, np.asarray(region.std)[:n_uw], 1.0)
-    each = np.repeat(decay, n_uw)
-    drive = np.tile(np.diag(1 / std), (pairs, 1)) * each[:, None]
+    names = [c.name for c in s.inputs[:n_uw]]
+    columns = [i for i, n in enumerate(names) if drivers is None or n in drivers]
+    each = np.repeat(decay, len(columns))
+    drive = np.tile(np.diag(1 / std)[columns], (pairs, 1)) * each[:, None]
     middle = np.asarray(region.mean)[:n_uw]
     filters = _poles(each, drive, middle)
     filtered = np.concatenate([r.follow(filters)[r.before :] for r in records])
-    coefficients = _regress(filtered, left).reshape(len(rows), pairs, n_uw)
-    drives = np.empty((pairs, n_uw), dtype=complex)
+    coefficients = _regress(filtered, left).reshape(len(rows), pairs, len(columns))
+    drives = np.zeros((pairs, n_uw), dtype=complex)
     for k in range(pairs):
         best = np.linalg.svd(coefficients[:, k], full_matrices=False)[2][0]
-        drives[k] = best * decay[k] / std
+        drives[k, columns] = best * decay[k] / std[columns]
     paths = np.concatenate([r.follow(_poles(decay, drives, middle)) for r in records])
     drives /= np.sqrt(np.mean(np.abs(paths) ** 2, axis=0) / 2)[:, None]
     found = _poles(decay, drives, middle)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,6 +157,13 @@ class NormalEquations:
         partial = partial + 1e-9 * np.eye(len(partial))
         return partial * np.outer(scale[columns], scale[columns])
 
+    def holding(
+        self, found: Solution, columns: Sequence[int], fixed: Array, affine: bool
+    ) -> Solution:
+        """A solution with some inputs' coefficients given and the best others; see `complete`."""
+        L, offset, rss = self.complete(columns, fixed, affine)
+        return replace(found, coefficients=L, offset=offset, residual_variance=rss)
+
     def complete(
         self, columns: Sequence[int], fixed: Array, affine: bool
     ) -> tuple[Array, Array, Array]:
@@ -211,12 +218,6 @@ class Solution:
         low = self.eigenvalues[0]
         return float(np.sqrt(self.eigenvalues[-1] / low)) if low > 0 else float("inf")
 
-    def holding(self, columns: Sequence[int], coefficients: Array) -> Solution:
-        """The same with other coefficients of some inputs, ``(target, len(columns))``."""
-        changed = self.coefficients.copy()
-        changed[:, list(columns)] = coefficients
-        return replace(self, coefficients=changed)
-
     def confounded(self, names: list[str]) -> list[str]:
         """Name the inputs that dominate the direction in which the data hardly vary."""
         weight = np.abs(self.directions[:, 0])
@@ -234,7 +235,10 @@ def merge(parts: Sequence[NormalEquations]) -> NormalEquations:
 
 
 def shared_coefficients(
-    parts: Sequence[NormalEquations], columns: Sequence[int], affine: bool
+    parts: Sequence[NormalEquations],
+    columns: Sequence[int],
+    affine: bool,
+    given: Mapping[tuple[int, int], float] | None = None,
 ) -> Array:
     """Least-squares coefficients of some inputs that all parts share; the others are free in each.
 
@@ -246,6 +250,8 @@ def shared_coefficients(
         The inputs in question.
     affine
         Every part has an offset of its own.
+    given
+        Some of them, which are not fitted, by target and place in `columns`.
 
     Returns
     -------
@@ -266,4 +272,12 @@ def shared_coefficients(
         out = out / scale[:, None]
         left += part.count * (products[np.ix_(some, some)] - out.T @ products[rest][:, some])
         right += part.count * (products[some, m:] - out.T @ products[rest, m:])
-    return np.linalg.lstsq(left, right, rcond=None)[0].T
+    found = np.linalg.lstsq(left, right, rcond=None)[0].T
+    for target in {t for t, _ in given or {}}:
+        held = {k: value for (t, k), value in (given or {}).items() if t == target}
+        fixed, open_ = list(held), [k for k in range(len(some)) if k not in held]
+        values = np.array(list(held.values()))
+        rest = right[open_, target] - left[np.ix_(open_, fixed)] @ values
+        found[target, fixed] = values
+        found[target, open_] = np.linalg.lstsq(left[np.ix_(open_, open_)], rest, rcond=None)[0]
+    return found

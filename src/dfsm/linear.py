@@ -10,8 +10,8 @@ combination of two fitted ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import equinox as eqx
@@ -41,10 +41,15 @@ class LTI:
     margin
         If set, eigenvalues of A with a real part above ``-margin`` (1/s) are moved there, see
         `stabilise`. Never for a system that is truly unstable.
+    known
+        Coefficients that physics gives, by state and by control or disturbance, in the units of
+        the channels: ``{"GenSpeed": {"GenTq": -2.997e-5}}`` says that 1 kN m slows the rotor by
+        2.997e-5 rpm/s. They enter the highest derivative of the state and are never changed.
     """
 
     kind: Literal["LTI"] = "LTI"
     affine: bool = True
+    known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     margin: float | None = None
 
 
@@ -61,6 +66,8 @@ class LPV:
     constant
         Inputs whose coefficients are the same at all points, where physics says so: a torque
         changes a speed by one over the inertia, whatever the wind.
+    known
+        As for `LTI`; these inputs are constant for all states.
     affine
         Fit an offset in every window.
     margin
@@ -71,6 +78,7 @@ class LPV:
     schedule: str
     points: int = 5
     constant: tuple[str, ...] = ()
+    known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     affine: bool = True
     margin: float | None = None
 
@@ -88,12 +96,15 @@ class LinearModel(eqx.Module):
         b at every schedule point, shape ``(point, target)``.
     schedule
         Column of the input vector that schedules, None for an LTI model.
+    known
+        Pairs of target and input whose coefficient was given, not fitted.
     """
 
     grid: jax.Array
     coefficients: jax.Array
     offsets: jax.Array
     schedule: int | None = eqx.field(static=True)
+    known: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
     def at(self, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
         """Return L, shape ``(target, input)``, and b, shape ``(target,)``, at a schedule value.
@@ -207,6 +218,7 @@ def fit_linear(
     input_names: Sequence[str],
     choice: LTI | LPV,
     windows: Array | None = None,
+    known: Mapping[tuple[int, int], float] | None = None,
 ) -> LinearFit:
     """Fit targets on inputs in one pass over blocks of samples (Sec. 3.4, Eq. 7).
 
@@ -221,6 +233,8 @@ def fit_linear(
         `LTI` or `LPV`.
     windows
         Schedule windows from `schedule_windows`; needed for an LPV fit.
+    known
+        Coefficients that are given, by target and input.
 
     Returns
     -------
@@ -255,9 +269,12 @@ def fit_linear(
             schedule_sums[k] += s[inside].sum()
     _check_counts(sums, windows, choice)
     whole = merge(sums).solve(choice.affine)
-    constant = _constant(choice, input_names)
+    known = known or {}
+    constant = _constant(choice, input_names, known)
     if constant:
-        whole = whole.holding(constant, shared_coefficients(sums, constant, choice.affine))
+        given = {(t, constant.index(i)): value for (t, i), value in known.items()}
+        shared = shared_coefficients(sums, constant, choice.affine, given)
+        whole = merge(sums).holding(whole, constant, shared, choice.affine)
     solutions = [e.solve(choice.affine, whole, constant) for e in sums] if lpv else [whole]
     counts = np.array([e.count for e in sums])
     grid = schedule_sums / counts if lpv else np.zeros(1)
@@ -266,6 +283,7 @@ def fit_linear(
         coefficients=jnp.asarray(np.stack([s.coefficients for s in solutions])),
         offsets=jnp.asarray(np.stack([s.offset for s in solutions])),
         schedule=column,
+        known=tuple(known),
     )
     weights = counts / counts.sum()
     return LinearFit(
@@ -283,16 +301,18 @@ def fit_linear(
     )
 
 
-def _constant(choice: LTI | LPV, names: Sequence[str]) -> tuple[int, ...]:
-    if not isinstance(choice, LPV):
-        return ()
-    unknown = [n for n in choice.constant if n not in names]
+def _constant(
+    choice: LTI | LPV, names: Sequence[str], known: Iterable[tuple[int, int]]
+) -> tuple[int, ...]:
+    chosen = choice.constant if isinstance(choice, LPV) else ()
+    unknown = [n for n in chosen if n not in names]
     if unknown:
         raise DfsmError(
             f"linear.constant names '{unknown[0]}', which is not an input of the model; "
             + near_matches(unknown[0], names)
         )
-    return tuple(list(names).index(n) for n in choice.constant)
+    columns = [list(names).index(n) for n in chosen]
+    return tuple(dict.fromkeys([*columns, *(column for _, column in known)]))
 
 
 def _check_counts(sums: Sequence[NormalEquations], windows: Array, choice: LTI | LPV) -> None:

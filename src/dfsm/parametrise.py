@@ -19,7 +19,7 @@ from dfsm.derivatives import kinematic_rows
 from dfsm.latents import Poles, poles, with_poles
 from dfsm.linear import LinearModel
 from dfsm.model import DFSM
-from dfsm.types import Array
+from dfsm.types import Array, IntArray
 
 
 class Parametrisation(eqx.Module):
@@ -37,6 +37,10 @@ class Parametrisation(eqx.Module):
         Typical size of each of these derivatives, shape ``(row,)``, in its unit.
     scheduled, constant
         Input columns whose coefficients in these rows vary along the schedule, and the others.
+    free
+        Which of the constant coefficients may change, by row: those that physics gave stay.
+    driven
+        Input columns that drive the latent pairs.
     """
 
     model: DFSM
@@ -44,6 +48,8 @@ class Parametrisation(eqx.Module):
     rows: tuple[int, ...] = eqx.field(static=True)
     scheduled: tuple[int, ...] = eqx.field(static=True)
     constant: tuple[int, ...] = eqx.field(static=True)
+    free: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    driven: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
     def of(cls, model: DFSM, spread: Array) -> Parametrisation:
@@ -53,13 +59,16 @@ class Parametrisation(eqx.Module):
         rows = tuple(i for i in range(len(s.observed)) if i not in known)
         L = np.asarray(model.f.coefficients)[:, list(rows)]
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
+        varies[[column for _, column in model.f.known]] = False
         # Nothing is known yet about states that have only been added.
         varies[s.observed_columns.stop :] |= np.array(
             [c in s.latents for c in (*s.latents, *s.parameters)], dtype=bool
         )
         scheduled, constant = (tuple(np.flatnonzero(v).tolist()) for v in (varies, ~varies))
+        free = tuple(tuple((i, c) not in model.f.known for c in constant) for i in rows)
         typical = np.maximum(spread[list(rows)], np.finfo(float).tiny)
-        return cls(model, jnp.asarray(typical), rows, scheduled, constant)
+        driven = tuple(np.flatnonzero(np.asarray(poles(model).drive).any(axis=0)).tolist())
+        return cls(model, jnp.asarray(typical), rows, scheduled, constant, free, driven)
 
     @property
     def size(self) -> int:
@@ -67,10 +76,16 @@ class Parametrisation(eqx.Module):
         return sum(int(np.prod(shape)) for shape in self._shapes)
 
     @property
-    def latent_part(self) -> slice:
-        """Where the parameters of the latent states' own dynamics lie in the vector."""
+    def latent_columns(self) -> IntArray:
+        """Where the parameters of each pair's dynamics lie in the vector, ``(pair, own)``.
+
+        In the order decay, frequency, drives and offset of the real part, those of the imaginary.
+        """
         sizes = [int(np.prod(shape)) for shape in self._shapes[:4]]
-        return slice(sum(sizes[:2]), sum(sizes))
+        first, pairs = sum(sizes[:2]), self._shapes[2][1]
+        dynamics = np.arange(sizes[2]).reshape(2, pairs)
+        drive = sizes[2] + np.arange(sizes[3]).reshape(2, pairs, len(self.driven) + 1)
+        return first + np.concatenate([dynamics.T, *drive], axis=1)
 
     @property
     def _shapes(self) -> list[tuple[int, ...]]:
@@ -80,7 +95,7 @@ class Parametrisation(eqx.Module):
             (points, rows, len(self.scheduled) + 1),
             (rows, len(self.constant)),
             (2, pairs),
-            (2, pairs, len(self.model.signals.driving) + 1),
+            (2, pairs, len(self.driven) + 1),
             *self._corrective_shapes,
         ]
 
@@ -102,7 +117,7 @@ class Parametrisation(eqx.Module):
         return self._latents(model, dynamics, drive) if self.model.signals.latents else model
 
     def slopes(self, deviations: jax.Array, model: DFSM, inputs: jax.Array) -> jax.Array:
-        """∂f̂/∂θ at one input vector, ``(state, parameter)``.
+        """∂f̂/∂θ of the observed states at one input vector, ``(observed state, parameter)``.
 
         Written out because it is what refinement spends its time on; tracing `at` backwards gives
         the same several times slower.
@@ -116,42 +131,57 @@ class Parametrisation(eqx.Module):
         inputs
             I, shape ``(input,)``.
         """
-        s, region = self.model.signals, self.model.region
-        states, n_uw = len(s.states), len(s.driving)
-        std = jnp.where(region.std > 0, region.std, 1.0)
-        z = (inputs - region.mean) / std
-        line = jnp.zeros((states, len(self.rows)))
+        observed, z = len(self.model.signals.observed), self._standardised(inputs)
+        line = jnp.zeros((observed, len(self.rows)))
         line = line.at[list(self.rows), np.arange(len(self.rows))].set(self.spread)
         hats = model.f.shares(inputs)
-        one = jnp.ones(1)
+        moved = jnp.concatenate([z[np.array(self.scheduled, dtype=int)], jnp.ones(1)])
         parts = [
-            jnp.einsum(
-                "sr,k,j->skrj",
-                line,
-                hats,
-                jnp.concatenate([z[np.array(self.scheduled, dtype=int)], one]),
-            ),
-            jnp.einsum("sr,j->srj", line, z[np.array(self.constant, dtype=int)]),
+            jnp.einsum("sr,k,j->skrj", line, hats, moved),
+            jnp.einsum("sr,j,rj->srj", line, z[self._constant_columns], self._free),
+            jnp.zeros((observed, self.latent_columns.size)),
         ]
-        if s.latents:
-            now, start = poles(model), poles(self.model)
-            first = len(s.observed)
-            latent = inputs[n_uw + first : n_uw + states]
-            a, b = latent[::2], latent[1::2]
-            even = np.eye(states)[:, first::2]
-            odd = np.eye(states)[:, first + 1 :: 2]
-            decay = -now.decay * (even * a + odd * b)
-            frequency = now.frequency * (even * b - odd * a)
-            size = jnp.hypot(start.decay, start.frequency)
-            moved = jnp.concatenate([z[:n_uw], one])
-            drive = [jnp.einsum("sp,p,j->spj", row, size, moved) for row in (even, odd)]
-            parts += [jnp.stack([decay, frequency], axis=1), jnp.stack(drive, axis=1)]
         if self._corrective_shapes:
             corrective = self._parts(deviations)[4:]
             by_part = jax.jacrev(lambda parts: self._correction(parts, inputs))(corrective)
-            rows = np.eye(states)[:, list(self.model.corrected)]
+            rows = np.eye(observed)[:, list(self.model.corrected)]
             parts += [rows @ p.reshape(len(self.model.corrected), -1) for p in by_part]
-        return jnp.concatenate([p.reshape(states, -1) for p in parts], axis=1)
+        return jnp.concatenate([p.reshape(observed, -1) for p in parts], axis=1)
+
+    def latent_slopes(self, model: DFSM, inputs: jax.Array) -> jax.Array:
+        """∂f̂/∂θ of each latent pair and its own parameters, ``(pair, 2, own)``.
+
+        Parameters
+        ----------
+        model, inputs
+            As for `slopes`.
+        """
+        s, now, start = self.model.signals, poles(model), poles(self.model)
+        z = self._standardised(inputs)
+        first = len(s.driving) + len(s.observed)
+        latent = inputs[first : first + len(s.latents)].reshape(-1, 2)
+        turned = jnp.stack([latent[:, 1], -latent[:, 0]], axis=1)
+        moved = jnp.concatenate([z[np.array(self.driven, dtype=int)], jnp.ones(1)])
+        drive = jnp.hypot(start.decay, start.frequency)[:, None] * moved
+        none = jnp.zeros_like(drive)
+        by_drive = jnp.stack(
+            [jnp.concatenate([drive, none], axis=1), jnp.concatenate([none, drive], axis=1)], axis=1
+        )
+        decay = -now.decay[:, None] * latent
+        frequency = now.frequency[:, None] * turned
+        return jnp.concatenate([decay[..., None], frequency[..., None], by_drive], axis=2)
+
+    def _standardised(self, inputs: jax.Array) -> jax.Array:
+        region = self.model.region
+        return (inputs - region.mean) / jnp.where(region.std > 0, region.std, 1.0)
+
+    @property
+    def _constant_columns(self) -> IntArray:
+        return np.array(self.constant, dtype=int)
+
+    @property
+    def _free(self) -> Array:
+        return np.array(self.free, dtype=float).reshape(len(self.rows), len(self.constant))
 
     def _parts(self, deviations: jax.Array) -> list[jax.Array]:
         parts, start = [], 0
@@ -166,7 +196,7 @@ class Parametrisation(eqx.Module):
         std = jnp.where(region.std > 0, region.std, 1.0)
         change = jnp.zeros((len(f.grid), len(self.rows), len(std)))
         change = change.at[:, :, np.array(self.scheduled, dtype=int)].set(scheduled[..., :-1])
-        change = change.at[:, :, np.array(self.constant, dtype=int)].set(constant)
+        change = change.at[:, :, self._constant_columns].set(constant * self._free)
         L = change * self.spread[:, None] / std
         # The offset belongs to the middle of the data, where coefficients do not disturb it.
         b = scheduled[..., -1] * self.spread - L @ region.mean
@@ -179,14 +209,15 @@ class Parametrisation(eqx.Module):
     def _latents(self, model: DFSM, dynamics: jax.Array, drive: jax.Array) -> DFSM:
         """Decay and frequency change by factors, so that no latent state becomes unstable."""
         now, region = poles(self.model), self.model.region
-        n_uw = len(self.model.signals.driving)
-        std = jnp.where(region.std > 0, region.std, 1.0)[:n_uw]
+        columns = np.array(self.driven, dtype=int)
+        std = jnp.where(region.std > 0, region.std, 1.0)[columns]
         decay, frequency = jnp.exp(dynamics) * jnp.stack([now.decay, now.frequency])
         # Per unit of an input's spread a pair moves by about one.
         size = jnp.hypot(now.decay, now.frequency)
         b = (drive[0, :, :-1] + 1j * drive[1, :, :-1]) * size[:, None] / std
-        offset = (drive[0, :, -1] + 1j * drive[1, :, -1]) * size - b @ region.mean[:n_uw]
-        return with_poles(model, Poles(decay, frequency, now.drive + b, now.offset + offset))
+        offset = (drive[0, :, -1] + 1j * drive[1, :, -1]) * size - b @ region.mean[columns]
+        drives = now.drive.at[:, columns].add(b)
+        return with_poles(model, Poles(decay, frequency, drives, now.offset + offset))
 
     def _correction(self, parts: list[jax.Array], inputs: jax.Array) -> jax.Array:
         e = self._corrective(parts)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
-from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning, near_matches
 from dfsm.latent_start import start_latents
 from dfsm.latents import as_states, poles, with_latent_range
 from dfsm.model import DFSM
@@ -55,6 +55,8 @@ class RefineSettings:
         Integration step in s; inputs are averaged over it.
     latents
         Number of latent states to add to a model that has none, an even number, see `latents.py`.
+    latent_inputs
+        Controls and disturbances that drive them; None takes all.
     iterations
         Largest number of Levenberg-Marquardt steps per stage.
     hold_out
@@ -69,6 +71,7 @@ class RefineSettings:
     step: float = 0.25
     iterations: int = 20
     latents: int = 0
+    latent_inputs: tuple[str, ...] | None = None
     hold_out: float = 0.2
     weights: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
@@ -171,7 +174,8 @@ def refine(
     at = np.zeros(parameters.size)
     before = after = final.relative(at)
     if choices.latents and not model.signals.latents:
-        with_latents = start_latents(model, train, choices.latents, spread)
+        drivers = _drivers(model, choices)
+        with_latents = start_latents(model, train, choices.latents, spread, drivers)
         parameters = Parametrisation.of(with_latents, spread)
         final = RolloutError(parameters, held, choices.windows[-1], weights)
         at = np.zeros(parameters.size)
@@ -193,6 +197,17 @@ def refine(
         refined = with_latent_range(refined, paths)
     names = {"training": [r.name for r in training], "validation": [r.name for r in validation]}
     return _result(model, refined, (before, after), history, names)
+
+
+def _drivers(model: DFSM, choices: RefineSettings) -> tuple[str, ...] | None:
+    names = [c.name for c in model.signals.inputs if c.name in model.signals.driving]
+    unknown = [n for n in choices.latent_inputs or () if n not in names]
+    if unknown:
+        raise DfsmError(
+            f"refine.latent_inputs names '{unknown[0]}', which is no control or disturbance of "
+            "the model; " + near_matches(unknown[0], names)
+        )
+    return choices.latent_inputs
 
 
 def _weights(model: DFSM, choices: RefineSettings) -> Array:

@@ -152,6 +152,10 @@ def _windows(record: Record, length: float | None) -> _Windows:
     )
 
 
+# States, slopes of the observed ones, slopes of the latent pairs.
+_At = tuple[jax.Array, jax.Array, jax.Array]
+
+
 class RolloutError:
     """|r|² of rollouts over windows, with JᵀJ and Jᵀr by forward sensitivities.
 
@@ -233,7 +237,7 @@ def _sums(
     follow = partial(_sensitivities, parameters, w, windows.step)
     xs, S = jax.vmap(follow)(starts, slopes, jnp.asarray(windows.inputs))
     r = (xs[..., : len(scale)] - windows.states[:, 1:]) * scale
-    J = (S[..., : len(scale), :] * scale[:, None]).reshape(-1, w.size)
+    J = (S * scale[:, None]).reshape(-1, w.size)
     return J.T @ J, J.T @ r.ravel()
 
 
@@ -242,10 +246,12 @@ def _sensitivities(
     w: jax.Array,
     step: float,
     x0: jax.Array,
-    S0: jax.Array,
+    pairs0: jax.Array,
     v: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """States and their slopes after every step, as `rk4` would find them.
+    """States and slopes of the observed ones after every step, as `rk4` would find them.
+
+    A latent pair depends on its own parameters alone, so that its slopes are few.
 
     Parameters
     ----------
@@ -253,59 +259,75 @@ def _sensitivities(
         The model.
     step
         In s.
-    x0, S0
-        States at the start and their slopes, shapes ``(state,)`` and ``(state, parameter)``.
+    x0
+        States at the start, shape ``(state,)``.
+    pairs0
+        Slopes of the latent pairs there, shape ``(pair, 2, own)``.
     v
         Exogenous inputs at ends and middles, ``(2 step + 1, exogenous)``.
 
     Returns
     -------
     tuple of Array
-        Shapes ``(step, state)`` and ``(step, state, parameter)``.
+        Shapes ``(step, state)`` and ``(step, observed state, parameter)``.
     """
     plain = parameters.at(w)
-    model = plain.prepared()
+    model, dynamics = plain.prepared(), poles(plain)
     low, high = clip_range(model, _FAR)
+    observed, columns = len(plain.signals.observed), parameters.latent_columns
+    first, last = (columns.min(), columns.max() + 1) if columns.size else (0, 0)
+    order = np.argsort(columns, axis=None)
+    M = jnp.stack([-dynamics.decay, dynamics.frequency, -dynamics.frequency, -dynamics.decay])
+    M = M.T.reshape(-1, 2, 2)
 
-    def slope(x: jax.Array, S: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def slope(x: jax.Array, S: jax.Array, P: jax.Array, v: jax.Array) -> _At:
         value, pull = jax.vjp(lambda x: rate(model, x, v), x)
-        (A,) = jax.vmap(pull)(jnp.eye(len(x)))
-        u_w_p = exogenous_groups(model, v)
-        return value, A @ S + parameters.slopes(w, plain, model.join(x, *u_w_p))
+        (A,) = jax.vmap(pull)(jnp.eye(observed, len(x)))
+        inputs = model.join(x, *exogenous_groups(model, v))
+        grown = A[:, :observed] @ S + parameters.slopes(w, plain, inputs)
+        if columns.size:
+            seen = jnp.einsum("skc,kcq->skq", A[:, observed:].reshape(observed, -1, 2), P)
+            through = seen.reshape(observed, -1)[:, order]
+            grown = grown.at[:, first:last].add(through)
+            P = M @ P + parameters.latent_slopes(plain, inputs)
+        return value, grown, P
 
-    def advance(
-        at: tuple[jax.Array, jax.Array], drive: tuple[jax.Array, ...]
-    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    def advance(at: _At, drive: tuple[jax.Array, ...]) -> tuple[_At, tuple[jax.Array, jax.Array]]:
         v0, vm, v1 = drive
         k1 = slope(*at, v0)
         k2 = slope(*_moved(at, k1, step / 2), vm)
         k3 = slope(*_moved(at, k2, step / 2), vm)
         k4 = slope(*_moved(at, k3, step), v1)
         total = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-        x, S = _moved(at, total, step)
+        x, S, P = _moved(at, total, step)
         held = jnp.clip(x, low, high)
-        at = held, jnp.where((held == x)[:, None], S, 0.0)
-        return at, at
+        same = held == x
+        S = jnp.where(same[:observed, None], S, 0.0)
+        P = jnp.where(same[observed:].reshape(-1, 2)[..., None], P, 0.0)
+        return (held, S, P), (held, S)
 
-    return jax.lax.scan(advance, (x0, S0), (v[:-2:2], v[1::2], v[2::2]))[1]
+    S0 = jnp.zeros((observed, w.size))
+    return jax.lax.scan(advance, (x0, S0, pairs0), (v[:-2:2], v[1::2], v[2::2]))[1]
 
 
-def _moved(
-    at: tuple[jax.Array, jax.Array], k: tuple[jax.Array, jax.Array], dt: float
-) -> tuple[jax.Array, jax.Array]:
-    return at[0] + dt * k[0], at[1] + dt * k[1]
+def _moved(at: _At, k: _At, dt: float) -> _At:
+    return at[0] + dt * k[0], at[1] + dt * k[1], at[2] + dt * k[2]
 
 
 def _start_slopes(parameters: Parametrisation, w: jax.Array, windows: _Windows) -> jax.Array:
-    """Slopes of the states at the starts, ``(window, state, parameter)``."""
-    part = parameters.latent_part
+    """Slopes of the latent pairs at the starts, ``(window, pair, 2, own)``."""
+    columns = parameters.latent_columns
+    pairs, own = columns.shape
+    if not pairs:
+        return jnp.zeros((len(windows.first), 0, 2, own))
 
-    def starts(some: jax.Array) -> jax.Array:
-        return _starts(parameters.at(w.at[part].set(some)), windows)
+    def starts(change: jax.Array) -> jax.Array:
+        # Each pair follows its own parameters, so one direction serves all pairs.
+        moved = w.at[columns].add(change)
+        latent = _starts(parameters.at(moved), windows)[:, -2 * pairs :]
+        return latent.reshape(-1, pairs, 2)
 
-    count, states = len(windows.first), len(parameters.model.signals.states)
-    zero = jnp.zeros((count, states, w.size))
-    return zero if part.start == part.stop else zero.at[..., part].set(jax.jacfwd(starts)(w[part]))
+    return jax.jacfwd(starts)(jnp.zeros(own))
 
 
 def _starts(model: DFSM, windows: _Windows) -> jax.Array:

@@ -118,7 +118,7 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
         structure[name] = None
         if linear is not None:
             keep(name, linear, _LINEAR)
-            structure[name] = {"schedule": linear.schedule}
+            structure[name] = {"schedule": linear.schedule, "known": linear.known}
     for name, corrective in (("e", model.e), ("e_g", model.e_g)):
         structure[name] = None
         if isinstance(corrective, GaussianUnits):
@@ -153,7 +153,8 @@ def _put_together(
         if found is None:
             return None
         grid, coefficients, offsets = arrays(name, _LINEAR)
-        return LinearModel(grid, coefficients, offsets, found["schedule"])
+        known = tuple((int(row), int(column)) for row, column in found.get("known", ()))
+        return LinearModel(grid, coefficients, offsets, found["schedule"], known)
 
     def corrective(name: str) -> Corrective | None:
         found = structure[name]
