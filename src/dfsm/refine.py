@@ -23,13 +23,14 @@ from itertools import islice
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.correction import destabilised
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
 from dfsm.errors import DfsmError, DfsmWarning, near_matches
-from dfsm.latent_start import start_latents
 from dfsm.latents import as_states, poles, with_latent_range
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.progress import track
+from dfsm.refine_start import start_latents, start_network
 from dfsm.rollout_error import RolloutError, record_of
 from dfsm.settings import require, settings
 from dfsm.signals import Provenance
@@ -57,8 +58,14 @@ class RefineSettings:
         Number of latent states to add to a model that has none, an even number, see `latents.py`.
     latent_inputs
         Controls and disturbances that drive them; None takes all.
+    network
+        Hidden units of a tanh network to add to a derivative function that the fit left
+        uncorrected; what derivatives do not show, rollouts may.
     iterations
         Largest number of Levenberg-Marquardt steps per stage.
+    decay
+        Weight of the squared deviations from the start, in which a unit changes a derivative by
+        about its own spread, beside the sum of squared errors relative to their spread.
     hold_out
         Share of the runs that only decide when to stop, at least one.
     weights
@@ -72,6 +79,8 @@ class RefineSettings:
     iterations: int = 20
     latents: int = 0
     latent_inputs: tuple[str, ...] | None = None
+    network: int = 0
+    decay: float = 0.0
     hold_out: float = 0.2
     weights: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
@@ -84,6 +93,8 @@ class RefineSettings:
         require(self.step > 0, "refine.step", self.step, "more than 0 s")
         even = self.latents >= 0 and self.latents % 2 == 0
         require(even, "refine.latents", self.latents, "an even number: they come in pairs")
+        require(self.network >= 0, "refine.network", self.network, "a number of units, or 0")
+        require(self.decay >= 0, "refine.decay", self.decay, "0 or more")
         require(self.iterations >= 1, "refine.iterations", self.iterations, "at least 1")
         require(0 < self.hold_out < 1, "refine.hold_out", self.hold_out, "a share between 0 and 1")
         for name, weight in self.weights.items():
@@ -132,7 +143,8 @@ def refine(
     ----------
     model
         Where to start: all coefficients of its derivative function may change, linear and
-        corrective ones and the dynamics of latent states; kinematic rows and outputs stay.
+        corrective ones and the dynamics of latent states; kinematic rows, coefficients that
+        physics gave, and outputs stay.
     runs
         Training runs; some of them are held out to decide when to stop.
     choices
@@ -173,18 +185,22 @@ def refine(
     final = RolloutError(parameters, held, choices.windows[-1], weights)
     at = np.zeros(parameters.size)
     before = after = final.relative(at)
+    started = model
     if choices.latents and not model.signals.latents:
         drivers = _drivers(model, choices)
-        with_latents = start_latents(model, train, choices.latents, spread, drivers)
-        parameters = Parametrisation.of(with_latents, spread)
+        started = start_latents(started, train, choices.latents, spread, drivers)
+    if choices.network and model.e is None:
+        started = start_network(started, choices.network, spread, seed)
+    if started is not model:
+        parameters = Parametrisation.of(started, spread)
         final = RolloutError(parameters, held, choices.windows[-1], weights)
         at = np.zeros(parameters.size)
     best, steady = at, _stability_kept(parameters)
     history: list[dict[str, float]] = []
     for stage, length in enumerate(choices.windows):
-        problem = RolloutError(parameters, train, length, weights)
+        problem = RolloutError(parameters, train, length, weights, choices.decay, steady)
         check = RolloutError(parameters, held, length, weights)
-        at, found = _stage(problem, check, at, choices.iterations, late, steady)
+        at, found = _stage(problem, check, at, choices.iterations, late)
         history += [{"stage": stage, **entry} for entry in found]
         error = final.relative(at)
         if error < after:
@@ -222,11 +238,19 @@ def _weights(model: DFSM, choices: RefineSettings) -> Array:
 
 
 def _stability_kept(parameters: Parametrisation) -> Callable[[Array], bool]:
-    """Whether a model is stable at all schedule values; always true if the start is not."""
+    """Whether a model is stable; always true if the start is not.
+
+    A linear one at all schedule values, one with a corrective function at all operating points.
+    """
     columns = parameters.model.signals.state_columns
-    if fastest_growth(parameters.model.f, columns) > 0:
-        return lambda _: True
-    return lambda at: fastest_growth(parameters.at(jnp.asarray(at)).f, columns) <= 0
+
+    def stable(at: Array) -> bool:
+        model = parameters.at(jnp.asarray(at))
+        if model.e is not None:
+            return destabilised(model) is None
+        return fastest_growth(model.f, columns) <= 0
+
+    return stable if stable(np.zeros(parameters.size)) else lambda _: True
 
 
 # -- stages -------------------------------------------------------------------------------------
@@ -238,7 +262,6 @@ def _stage(
     start: Array,
     limit: int,
     late: Callable[[], bool],
-    steady: Callable[[Array], bool],
 ) -> tuple[Array, list[dict[str, float]]]:
     """Step until the validation windows no longer improve; the best weights and the history."""
     if not np.isfinite(problem.cost(start)):
@@ -250,7 +273,7 @@ def _stage(
     for count, step in enumerate(track(islice(steps, limit), "refining", limit), start=1):
         now = check.relative(step.weights)
         history.append({"training": problem.relative(step.weights), "validation": now})
-        if now < error and steady(step.weights):
+        if now < error:
             best, error, taken = step.weights, now, count
         if count - taken >= _PATIENCE or late():
             break

@@ -169,6 +169,10 @@ class RolloutError:
         Of the windows in s; None takes whole runs.
     weights
         Of the observed states' squared errors.
+    decay
+        Weight of the squared deviations, added to |r|².
+    allowed
+        Whether deviations are allowed; the cost of all others is infinite.
     """
 
     def __init__(
@@ -177,7 +181,10 @@ class RolloutError:
         records: Sequence[Record],
         length: float | None,
         weights: Array,
+        decay: float = 0.0,
+        allowed: Callable[[Array], bool] | None = None,
     ) -> None:
+        self._decay, self._allowed = decay, allowed
         self._batches = [_windows(r, length) for r in records]
         overall = np.concatenate([r.states for r in records]).std(axis=0)
         self._scales = [
@@ -199,19 +206,22 @@ class RolloutError:
             return list(pool.map(one, range(len(self._batches))))
 
     def cost(self, weights: Array) -> float:
-        """|r|², infinite where a rollout is not finite."""
-        total = float(np.sum([float(v) for v in self._over_runs(_square, weights)]))
-        return total if np.isfinite(total) else np.inf
+        """|r|² and decay, infinite where a rollout is not finite or the weights are not allowed."""
+        total = self.relative(weights) * self._count + self._decay * float(weights @ weights)
+        if np.isfinite(total) and self._allowed is not None and not self._allowed(weights):
+            return np.inf
+        return total
 
     def relative(self, weights: Array) -> float:
-        """Mean square of r: 1 is as wrong as a constant."""
-        return self.cost(weights) / self._count
+        """Mean square of r: 1 is as wrong as a constant; infinite where one is not finite."""
+        total = float(np.sum([float(v) for v in self._over_runs(_square, weights)]))
+        return total / self._count if np.isfinite(total) else np.inf
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
-        """JᵀJ and Jᵀr."""
+        """JᵀJ and Jᵀr, the decay included."""
         parts = self._over_runs(_sums, weights)
         JtJ, Jtr = (np.sum([np.asarray(p[k]) for p in parts], axis=0) for k in (0, 1))
-        return JtJ, Jtr
+        return JtJ + self._decay * np.eye(len(Jtr)), Jtr + self._decay * weights
 
 
 @eqx.filter_jit

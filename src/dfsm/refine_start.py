@@ -1,16 +1,19 @@
-"""Where the learning of latent states starts: poles over a range, drives from what a fit left over.
+"""What refinement adds to a model, and where the learning of it starts.
 
-What a linear fit of the derivatives leaves over is regressed on the inputs filtered by each pole.
-The best single drive per pole is the leading singular pair of those coefficients.
+Latent states: poles over a range. What a linear fit of the derivatives leaves over is regressed on
+the inputs filtered by each pole; the best single drive per pole is the leading singular pair of
+those coefficients. A network: directions drawn at random, and nothing added to the derivatives yet.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.corrective.functions import Perceptron
 from dfsm.latents import Poles, add_latents, as_states
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
@@ -80,6 +83,37 @@ def start_latents(
     coupling[rows] = both * spread[rows, None]
     along = [np.asarray(as_states(jnp.asarray(z))) for z in pairs_along]
     return add_latents(model, found, coupling, along)
+
+
+def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
+    """Add a tanh network to a derivative function that nothing corrects.
+
+    Parameters
+    ----------
+    model
+        Has no corrective function.
+    hidden
+        Number of units.
+    spread
+        Typical size of the observed states' derivatives, shape ``(state,)``.
+    seed
+        Draws the directions.
+
+    Returns
+    -------
+    DFSM
+        Predicts what it did before.
+    """
+    rows = Parametrisation.of(model, spread).rows
+    rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
+    directions = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
+    network = Perceptron(
+        shift=region.mean,
+        scale=jnp.where(region.std > 0, region.std, 1.0),
+        weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
+        biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
+    )
+    return replace(model, e=network, corrected=rows)
 
 
 def _poles(decay: Array, drive: Array, middle: Array) -> Poles:
