@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
+from dfsm.control import DirectTranscription, OptimalControlProblem, solve
 from dfsm.corrective import RBF, GaussianUnits, NoCorrection, Perceptron
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError
@@ -170,6 +171,23 @@ def test_everything_else_takes_them(model, tmp_path, runs):
     assert checked.runs[0].models["multi-fidelity"].derivative_errors["q"] < 0.05
     assert len(model.region.low) == len(model.signals.inputs)
     assert simulate(model, driven(97), start=START).outside < 0.2
+
+
+def test_an_optimum_starts_from_what_went_before(model):
+    """Latent states are no choice of the optimiser where a run tells them."""
+    run = driven(98)
+    cost = {"horizon": (START, 30.0), "cost": lambda s: s.x.q**2 + s.u.u**2}
+    problem = OptimalControlProblem(model=model, disturbances=run, **cost)
+    known = initial_state(model, run, START)[1:]
+    assert list(problem.latent_starts) == ["latent1", "latent2"]
+    solution = solve(problem, DirectTranscription(mesh=10, refine=None), simulate=False)
+    assert solution.solved
+    names = ["latent1", "latent2"]
+    np.testing.assert_allclose(solution.trajectory.select(names).values[0], known, rtol=1e-9)
+    chosen = replace(problem, initial={"latent1": (None, None)})
+    assert list(chosen.latent_starts) == ["latent2"]
+    untold = replace(problem, disturbances=run.select(["w"]))
+    assert untold.latent_starts == {"latent1": [None], "latent2": [None]}
 
 
 @pytest.mark.parametrize("kind", ["units", "perceptron", "none"])

@@ -1,21 +1,19 @@
 """Optimal control of the floating turbine on surrogates of the bundled runs (Sec. 4 of the paper).
 
-Fits the models of the three wind regions as `demo.py` does, and maximises the power over 600 s of
-wind that the fits never saw, with the paper's bounds and with those of this turbine, for three
-limits of the platform pitch. Writes a page, its tables as JSON, and figures.
+Takes the models that `demo.py` saved and maximises the power over 600 s of wind that the fits never
+saw, with the paper's bounds and with those of this turbine, for three limits of the platform pitch.
+Writes a page, its tables as JSON, and figures.
 
-    python examples/iea15/optimal_control.py [--output out/] [--quick]
+    python examples/iea15/optimal_control.py [--models out/] [--output out/]
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 
 import dfsm
 from dfsm.console import print_article
@@ -23,46 +21,46 @@ from dfsm.report.publish import publish
 from dfsm.report.turbine_control import control_article
 from dfsm.studies.turbine_control import ControlStudy, ControlStudySize, Region, study
 
+DATA = Path(__file__).parent
+START = 100.0  # s, the start-up transient before it is dropped
 # Winds (m/s, as in the file names) and the seeds to optimise for: two in the transition region,
 # one below and one above it.
 SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
-QUICK = ControlStudySize(points=300, pitch_limits=(5.0, 7.0))
 
 
-def demo() -> ModuleType:
-    """The other example, which knows the runs and the settings of the fits."""
-    spec = importlib.util.spec_from_file_location("demo", Path(__file__).parent / "demo.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up by name.
-    sys.modules.setdefault("demo", module)
-    spec.loader.exec_module(module)
-    return module
+def runs(wind: str, seeds: range) -> list[dfsm.Trajectory]:
+    """Bundled closed-loop runs."""
+    stems = [f"iea15_2dof_{wind}mps_s{seed:02d}" for seed in seeds]
+    return list(dfsm.read_all([next(DATA.glob(f"{stem}.[op]*")) for stem in stems]))
 
 
-def regions(series: dict[str, range]) -> list[Region]:
-    """Fit one model for each region, without the start-up transients."""
-    data, found = demo(), []
+def regions(models: Path, series: Mapping[str, range]) -> list[Region]:
+    """Models and runs of each region; one model for all winds serves them all."""
+    everywhere, found = dfsm.load(models / "model_all_winds"), []
     for wind, seeds in series.items():
-        training = data.runs([wind], range(1, 9))
-        model = dfsm.fit(training, data.settings(5)).model
-        tests = data.runs([wind], seeds)
-        runs = [[r.window(data.START) for r in group] for group in (training, tests)]
-        found.append(Region(f"{int(wind)} m/s", model, *runs))
+        own = dfsm.load(models / f"model_{int(wind)}mps")
+        speed = float(wind)
+        training, tests = runs(wind, range(1, 9)), runs(wind, seeds)
+        name = f"{speed:g} m/s"
+        found.append(Region(name, speed, own, everywhere, training, tests, START))
     return found
 
 
-def main(arguments: Sequence[str] | None = None) -> ControlStudy:
-    """Fit, optimise, print the tables, write the page and the figures."""
+def main(
+    arguments: Sequence[str] | None = None,
+    series: Mapping[str, range] = SERIES,
+    size: ControlStudySize | None = None,
+) -> ControlStudy:
+    """Optimise, print the tables, write the page and the figures."""
     parser = argparse.ArgumentParser(description="Optimal control on bundled OpenFAST runs.")
+    parser.add_argument("--models", type=Path, default=Path("out"), help="folder of demo.py")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")
-    parser.add_argument("--quick", action="store_true", help="transition region, coarse mesh")
     options = parser.parse_args(arguments)
+    if not (options.models / "model_all_winds").is_dir():
+        parser.error(f"{options.models} holds no models: run examples/iea15/demo.py first")
     with dfsm.show_progress(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", dfsm.DfsmWarning)  # the fits' warnings are the demo's
-        chosen = {"12": range(9, 10)} if options.quick else SERIES
-        found = study(regions(chosen), QUICK if options.quick else None)
+        warnings.simplefilter("ignore", dfsm.DfsmWarning)  # they stand in the tables
+        found = study(regions(options.models, series), size)
     article = control_article(found)
     written = publish(article, options.output)
     print_article(article)
@@ -71,4 +69,4 @@ def main(arguments: Sequence[str] | None = None) -> ControlStudy:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -160,6 +160,20 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     return np.asarray(path)[: len(run)]
 
 
+def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
+    """Latent states at a time in s, shape ``(latent,)``, from the inputs recorded up to it.
+
+    Where the record begins there, they are at rest. The arguments are those of `latent_path`.
+    """
+    if not model.signals.latents:
+        return np.empty(0)
+    now = max(2, int(np.searchsorted(run.time, start, side="right")))
+    past = run.select(model.signals.driving)
+    past = replace(past, time=past.time[:now], values=past.values[:now])
+    path = latent_path(model, past)
+    return path[-1] if now > 2 else path[0]
+
+
 def rest(time: Array, inputs: Array) -> Array:
     """Inputs before a record begins, ``(input,)`` from ``(time, input)``."""
     return inputs[time <= time[0] + _REST].mean(axis=0)

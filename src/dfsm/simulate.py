@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.integrate import Case, Rollout, adapt, march, mesh_of
-from dfsm.latents import latent_path
+from dfsm.latents import latent_state
 from dfsm.model import DFSM
 from dfsm.settings import settings
 from dfsm.signals import require_constant, with_computed
@@ -210,7 +210,7 @@ def simulate(
         begins = float(driven[i].time[0])
         x0 = _observed_state(model, batch[i], begins) if given is None else given[i]
         if len(x0) < len(model.signals.states):
-            x0 = np.concatenate([x0, _latent_state(model, batch[i], begins)])
+            x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
         mesh = mesh_of(driven[i], options.step, options.interpolation)
         return Case(mesh, x0, _initial_azimuth(model, batch[i], begins))
 
@@ -247,7 +247,7 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     ndarray
         Shape ``(state,)``.
     """
-    latent = _latent_state(model, run, start)
+    latent = latent_state(model, run, start)
     return np.concatenate([_observed_state(model, run, start), latent])
 
 
@@ -261,16 +261,6 @@ def _given(model: DFSM, initial: ArrayLike, runs: int) -> Array:
             f"initial has shape {given.shape}, expected {' or '.join(map(str, shapes))}"
         )
     return np.broadcast_to(given, (runs, given.shape[-1]))
-
-
-def _latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
-    if not model.signals.latents:
-        return np.empty(0)
-    now = max(2, int(np.searchsorted(run.time, start, side="right")))
-    past = run.select(model.signals.driving)
-    past = replace(past, time=past.time[:now], values=past.values[:now])
-    path = latent_path(model, past)
-    return path[-1] if now > 2 else path[0]
 
 
 def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:

@@ -146,6 +146,10 @@ class Layout:
                 # A fixed end may touch a bound from outside by rounding.
                 low[at] = np.minimum(np.maximum(low[at], below), above)
                 high[at] = np.maximum(np.minimum(high[at], above), low[at])
+        for name, values in self.problem.latent_starts.items():
+            for at, value in zip(x[:, 0, plant.names("states").index(name)], values, strict=True):
+                if value is not None:
+                    low[at] = high[at] = value
         for at, name in zip(q, self.problem.free_parameters, strict=False):
             given = self.problem.parameters[name]
             below, above = self._inside(name, *map(np.atleast_1d, given))  # pyright: ignore

@@ -18,6 +18,7 @@ import numpy as np
 
 from dfsm.control.signals import GROUPS, Plant, plant_of
 from dfsm.errors import DfsmError, near_matches
+from dfsm.latents import latent_state
 from dfsm.model import DFSM
 from dfsm.settings import require
 from dfsm.signals import with_computed
@@ -58,7 +59,8 @@ class OptimalControlProblem:
         ``name: (low, high)`` for the rates of controls, in their units per second.
     initial, final
         ``name: value`` fixes a state at that end, ``name: (low, high)`` bounds it, and a state
-        that is not named is free within its bounds.
+        that is not named is free within its bounds. Latent states that are not named start from
+        the inputs recorded up to the first time, where a run holds them.
     constraints
         ``name: (function, low, high)``, path constraints; a function may return a vector.
     boundary
@@ -156,6 +158,25 @@ class OptimalControlProblem:
         if not isinstance(self.model, DFSM) or all(n in run for n in names):
             return run
         return with_computed(run, self.model.signals.hub_height, self.model.signals.features)
+
+    @cached_property
+    def latent_starts(self) -> dict[str, list[float | None]]:
+        """Latent states at the first time by name, one per scenario; None where that is free."""
+        if not isinstance(self.model, DFSM) or not self.model.signals.latents:
+            return {}
+        driving = self.model.signals.driving
+        known = [
+            latent_state(self.model, run, self.start)
+            if run is not None and all(n in run for n in driving)
+            else None
+            for run in self.scenarios
+        ]
+        names = [c.name for c in self.model.signals.latents]
+        return {
+            name: [None if values is None else float(values[k]) for values in known]
+            for k, name in enumerate(names)
+            if name not in self.initial
+        }
 
     @property
     def scenario_weights(self) -> Array:

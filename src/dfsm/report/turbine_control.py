@@ -68,7 +68,8 @@ def control_article(study: ControlStudy) -> Article:
             "Torque and blade pitch that maximise the power of a surrogate, with the wind known "
             "over the horizon and a limit Θp,max on the platform pitch: the study of Sundarrajan "
             "and Herber (IMECE 2023, Sec. 4) on other runs of the same turbine. Case a has the "
-            "paper's bounds, case b those of the turbine that was simulated."
+            "paper's bounds and a model of the wind region alone; case b has the bounds of the "
+            "turbine that was simulated and one model for all winds, refined on rollouts."
         ),
         sections=(
             trends_section(study),
@@ -100,9 +101,14 @@ def trends_section(study: ControlStudy) -> Section:
     )
     gains = Table(
         "control_gains",
-        "How the rotor speed of each model settles when a control rises for good, at the mean of "
-        "its training data",
-        ("region", "torque (rpm per MN m)", "blade pitch (rpm per deg)", "signs of a turbine"),
+        "How the rotor speed of each model settles when a control rises for good, at the mean wind "
+        "of the region",
+        (
+            "region, model",
+            "torque (rpm per MN m)",
+            "blade pitch (rpm per deg)",
+            "signs of a turbine",
+        ),
         tuple((name, *gain, _word(max(gain) < 0)) for name, gain in study.gains.items()),
         note=(
             "Both are negative for a turbine. Where one is positive, the model has learnt the "

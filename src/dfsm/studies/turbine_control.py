@@ -3,8 +3,9 @@
     minimise ∫ ( −η τ ω + w₁ τ² + w₂ β² ) dt     τ in MN m, ω in rpm, β in deg
 
 over torque and blade pitch, with the wind known over the horizon, for several limits of the
-platform pitch, and with two sets of bounds: the paper's and those of the turbine that was
-simulated. `examples/iea15/optimal_control.py` runs it on the bundled data.
+platform pitch, and with two sets of bounds: the paper's, on a model of the wind region alone, and
+those of the turbine that was simulated, on one model for all winds.
+`examples/iea15/optimal_control.py` runs it on the bundled data.
 """
 
 from __future__ import annotations
@@ -87,22 +88,6 @@ PAPER = Case(
 )
 
 
-def turbine_case(training: Sequence[Trajectory]) -> Case:
-    """Bounds for the turbine that was simulated: rated speed, and loads as in its own runs.
-
-    Parameters
-    ----------
-    training
-        Runs that the model was fitted to, without their start-up transient.
-    """
-    loads = {
-        name: float(np.percentile(np.abs(np.concatenate([r[name] for r in training])), _PERCENTILE))
-        for name in (SHEAR, MOMENT)
-    }
-    bounds = {**CONTROL_BOUNDS, SPEED: (1.9, 7.56)} | {n: (-v, v) for n, v in loads.items()}
-    return Case("b", "bounds of this turbine", 0.9576, -1.0, bounds)
-
-
 @settings
 class ControlStudySize:
     """How much to compute; the defaults are the paper's.
@@ -135,22 +120,31 @@ class ControlStudySize:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A range of wind speeds with its model and its runs, all without start-up transients.
+    """A range of wind speeds with its models and its runs.
 
     Attributes
     ----------
     name
         For tables, e.g. ``"12 m/s"``.
+    wind
+        Mean wind in m/s.
+    own
+        Model fitted to `training`, for case (a).
     model
-        Fitted to `training`.
+        Model for case (b), which may know more winds.
     training, tests
         Runs; the winds of the latter are what controls are optimised for.
+    start
+        Where the horizons begin, in s; the start-up transients before it do not count.
     """
 
     name: str
+    wind: float
+    own: DFSM
     model: DFSM
     training: Sequence[Trajectory]
     tests: Sequence[Trajectory]
+    start: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +247,7 @@ class ControlStudy:
     seconds
         Wall time.
     gains
-        By region, see `steady_gains`.
+        By model and wind, see `steady_gains`.
     """
 
     results: tuple[Result, ...]
@@ -269,6 +263,17 @@ class ControlStudy:
         return found
 
 
+def turbine_case(region: Region) -> Case:
+    """Bounds for the turbine that was simulated: rated speed, and loads as in its own runs."""
+    runs = [run.window(region.start) for run in region.training]
+    loads = {
+        name: float(np.percentile(np.abs(np.concatenate([r[name] for r in runs])), _PERCENTILE))
+        for name in (SHEAR, MOMENT)
+    }
+    bounds = {**CONTROL_BOUNDS, SPEED: (1.9, 7.56)} | {n: (-v, v) for n, v in loads.items()}
+    return Case("b", "bounds of this turbine", 0.9576, -1.0, bounds)
+
+
 def mean(run: Trajectory, values: Array) -> float:
     """Mean over time of values at a run's samples, by the trapezoidal rule."""
     return float(np.trapezoid(values, run.time) / run.duration)
@@ -280,7 +285,11 @@ def mean_power(run: Trajectory) -> float:
 
 
 def problem(
-    model: DFSM, wind: Trajectory, case: Case, most_pitch: float, duration: float = 600.0
+    model: DFSM,
+    wind: Trajectory,
+    case: Case,
+    most_pitch: float,
+    horizon: tuple[float, float],
 ) -> OptimalControlProblem:
     """The paper's problem for one wind series.
 
@@ -289,13 +298,13 @@ def problem(
     model
         With the channels of this study.
     wind
-        Run with the disturbances; the horizon begins with its first sample.
+        Run with the disturbances; what it holds before the horizon gives latent states.
     case
         Bounds and efficiency.
     most_pitch
         Θ_p,max in deg.
-    duration
-        Length of the horizon in s.
+    horizon
+        First and last time in s.
 
     Raises
     ------
@@ -312,10 +321,9 @@ def problem(
                 f"with states {PITCH} and {SPEED}, controls {TORQUE} and {BLADE}, and outputs "
                 f"{SHEAR} and {MOMENT}"
             )
-    start = float(wind.time[0])
     return OptimalControlProblem(
         model=model,
-        horizon=(start, start + duration),
+        horizon=horizon,
         cost=case.cost,
         bounds={**case.bounds, PITCH: (case.lowest_pitch, most_pitch)},
         disturbances=wind,
@@ -336,7 +344,7 @@ def optimise(
     Parameters
     ----------
     region
-        Gives the model.
+        Gives the models.
     wind
         One of the region's test runs.
     case, most_pitch
@@ -353,9 +361,11 @@ def optimise(
         tolerance=size.tolerance,
         stay_inside=inside,
     )
-    solution = solve(problem(region.model, wind, case, most_pitch, size.duration), method)
-    run, space = solution.trajectory, region.model.region
-    names = [c.name for c in region.model.signals.inputs]
+    model = region.own if case is PAPER else region.model
+    horizon = (region.start, region.start + size.duration)
+    solution = solve(problem(model, wind, case, most_pitch, horizon), method)
+    run, space = solution.trajectory, model.region
+    names = [c.name for c in model.signals.inputs]
     values, low, high = run.select(names).values, np.asarray(space.low), np.asarray(space.high)
     slack = 1e-9 * (high - low)
     beyond = ((values < low - slack) | (values > high + slack)).mean(axis=0)
@@ -377,17 +387,21 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
     size = size or ControlStudySize()
     begin, results = clock.perf_counter(), []
     for region in regions:
-        own = turbine_case(region.training)
+        own = turbine_case(region)
         variants = [(PAPER, False), (own, False), *([(own, True)] if size.inside else [])]
         for wind in region.tests:
             for case, inside in variants:
                 for most_pitch in size.pitch_limits:
                     results.append(optimise(region, wind, case, most_pitch, size, inside))
-    gains = {region.name: steady_gains(region.model) for region in regions}
+    gains = {}
+    for region in regions:
+        models = {"a": region.own, "b": region.model}
+        for key, model in models.items():
+            gains[f"{region.name}, case {key}"] = steady_gains(model, region.wind)
     return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
 
 
-def steady_gains(model: DFSM) -> tuple[float, float]:
+def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:
     """How the rotor speed of a model settles when torque or blade pitch rise for good.
 
     Both gains are negative for a turbine: either brakes the rotor. Closed-loop data can teach a
@@ -396,17 +410,18 @@ def steady_gains(model: DFSM) -> tuple[float, float]:
     Parameters
     ----------
     model
-        Linearised at the mean of its training data.
+        Linearised at its operating point.
+    wind
+        In m/s, where that is.
 
     Returns
     -------
     tuple of float
         In rpm per MN m and in rpm per deg.
     """
-    s, centre = model.signals, np.asarray(model.region.mean)
-    count = len(s.controls), len(s.disturbances), len(s.states)
-    u, w, x, p = np.split(centre, np.cumsum(count))
-    A, B, _, _ = model.jacobians(x, u, w, p)
+    s, grid = model.signals, np.asarray(model.region.grid)
+    point = np.array([np.interp(wind, grid, v) for v in np.asarray(model.region.operating).T])
+    A, B, _, _ = model.jacobians(*model.split(point))
     gain = -np.linalg.solve(A, B)
     row = gain[[c.name for c in s.states].index(SPEED)]
     names = [c.name for c in s.controls]
