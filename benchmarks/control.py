@@ -6,6 +6,7 @@ controls, coefficients scheduled in the wind and 200 Gaussian units in two rows,
 
 from __future__ import annotations
 
+from shutil import which
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,6 +29,8 @@ from dfsm.model import DFSM
 from dfsm.signals import Region, SignalTable
 from dfsm.trajectory import Channel, Trajectory
 
+# Solves of which the fastest is timed.
+REPEATS = 3
 POINTS = (250, 500, 1000, 2000, 4000, 8000)
 # Schemes with the order that theory gives them on smooth problems.
 ORDERS: dict[str, tuple[Kind, int, int]] = {
@@ -36,6 +39,9 @@ ORDERS: dict[str, tuple[Kind, int, int]] = {
     "radau 2": ("radau", 2, 3),
     "radau 3": ("radau", 3, 5),
 }
+# Of the solver where orders are measured; the default.
+TOLERANCE = 1e-8
+MESHES = (5, 10, 20, 40, 80, 160)
 SMOOTH = ("Hager1", "HagerHouRao1")
 SHOT = ("Hager1", "Vanderpol", "Brachistochrone", "HagerHouRao1", "TwoLinkRobot, energy")
 
@@ -46,10 +52,11 @@ def run() -> dict[str, Any]:
     Returns
     -------
     dict
-        ``known``: per problem and method the objective, its relative error, iterations and
-        seconds to solve; ``orders``: per smooth problem and scheme the errors on 5 to 40 intervals;
-        ``turbine``: per number of points the iterations and milliseconds per iteration;
-        ``expressions``: the same program in CasADi expressions, with times and objectives.
+        ``known``: per problem the optimal value, and per method the objective, its relative error,
+        iterations and seconds to solve; ``orders``: per smooth problem and scheme the errors on 5
+        to 160 intervals; ``turbine``: per number of points the iterations and milliseconds per
+        iteration; ``expressions``: the same program in CasADi expressions, with times and
+        objectives.
     """
     return {
         "known": known(),
@@ -70,7 +77,7 @@ def known() -> dict[str, Any]:
         }
         if name in SHOT:
             methods["multiple_shooting"] = MultipleShooting()
-        found[name] = {
+        found[name] = {"value": case.value} | {
             label: _figures(solve(case.problem, method, case.guess, simulate=False), case.value)
             for label, method in methods.items()
         }
@@ -89,7 +96,7 @@ def _figures(found: Solution, value: float) -> dict[str, Any]:
     }
 
 
-def orders(meshes: tuple[int, ...] = (5, 10, 20, 40)) -> dict[str, Any]:
+def orders(meshes: tuple[int, ...] = MESHES) -> dict[str, Any]:
     """Relative errors of the objective on finer and finer meshes, and the order they show."""
     found: dict[str, Any] = {}
     for name in SMOOTH:
@@ -97,13 +104,19 @@ def orders(meshes: tuple[int, ...] = (5, 10, 20, 40)) -> dict[str, Any]:
         for label, (kind, degree, order) in ORDERS.items():
             errors = []
             for mesh in meshes:
-                method = DirectTranscription(scheme=kind, degree=degree, mesh=mesh, refine=None)
+                method = DirectTranscription(
+                    scheme=kind, degree=degree, mesh=mesh, refine=None, tolerance=TOLERANCE
+                )
                 solution = solve(case.problem, method, case.guess, simulate=False)
                 errors.append(abs(solution.objective / case.value - 1))
             # The last meshes may have reached the solver's tolerance.
             shown = np.log2(np.array(errors[:-1]) / np.maximum(errors[1:], 1e-15))
             found[f"{name}, {label}"] = {
+                "problem": name,
+                "scheme": label,
                 "theory": order,
+                "tolerance": TOLERANCE,
+                "intervals": list(meshes),
                 "errors": errors,
                 "orders": [float(v) for v in shown],
             }
@@ -113,15 +126,20 @@ def orders(meshes: tuple[int, ...] = (5, 10, 20, 40)) -> dict[str, Any]:
 def against_expressions(points: int = 1000) -> dict[str, Any]:
     """The same nonlinear program by dfsm and in CasADi expressions, one after the other.
 
+    The fastest of three solves each, but for dfsm's first, which is one.
+
     dfsm a second time: with compiled code, from the start that it chooses itself and from its
-    solution.
+    solution. CasADi a second time: with its functions as C code, where there is a compiler.
     """
     problem = turbine()
     method = DirectTranscription(scheme="trapezoidal", mesh=points - 1, refine=None, tolerance=1e-7)
     first = solve(problem, method, simulate=False)
-    again = solve(problem, method, simulate=False)
-    warm = solve(problem, method, first, simulate=False)
-    other = solve_with_expressions(problem, points)
+    again = _fastest(problem, method)
+    warm = _fastest(problem, method, first)
+    other = solve_with_expressions(problem, points, repeats=REPEATS)
+    in_c = None
+    if which("gcc"):
+        in_c = solve_with_expressions(problem, points, compiled=True, repeats=REPEATS)
     ours = again.seconds["solve"] / again.iterations
     theirs = other["seconds_solve"] / other["iterations"]
     return {
@@ -129,9 +147,18 @@ def against_expressions(points: int = 1000) -> dict[str, Any]:
         "dfsm, compiled": _figures(again, other["objective"]),
         "dfsm, warm start": _figures(warm, other["objective"]),
         "casadi": other,
+        "casadi, compiled": in_c,
         "ms_per_iteration": {"dfsm": 1e3 * ours, "casadi": 1e3 * theirs},
         "casadi_over_dfsm": theirs / ours,
     }
+
+
+def _fastest(
+    problem: OptimalControlProblem, method: DirectTranscription, guess: Solution | None = None
+) -> Solution:
+    """Of several equal solves: other work on the machine only adds to their time."""
+    solutions = [solve(problem, method, guess, simulate=False) for _ in range(REPEATS)]
+    return min(solutions, key=lambda solution: solution.seconds["solve"])
 
 
 def turbine_times(points: tuple[int, ...] = POINTS) -> dict[str, Any]:
@@ -141,11 +168,11 @@ def turbine_times(points: tuple[int, ...] = POINTS) -> dict[str, Any]:
         method = DirectTranscription(
             scheme="trapezoidal", mesh=count - 1, refine=None, tolerance=1e-7
         )
-        solution = solve(problem, method, simulate=False)
+        fastest = _fastest(problem, method)
         found[str(count)] = {
-            "ending": solution.ending.name,
-            "iterations": solution.iterations,
-            "ms_per_iteration": 1e3 * solution.seconds["solve"] / solution.iterations,
+            "ending": fastest.ending.name,
+            "iterations": fastest.iterations,
+            "ms_per_iteration": 1e3 * fastest.seconds["solve"] / fastest.iterations,
         }
     return found
 
