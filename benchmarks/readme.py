@@ -1,4 +1,4 @@
-"""Write the tables of the README and of docs/method.md, and its figure, from measurements.
+"""Write the tables of the README and of the pages in docs/, and figures, from measurements.
 
 python -m benchmarks > figures.json && python -m benchmarks.readme figures.json
 """
@@ -6,14 +6,19 @@ python -m benchmarks > figures.json && python -m benchmarks.readme figures.json
 from __future__ import annotations
 
 import json
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from dfsm.report.article import Table, cell_text
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-FILES = (ROOT / "README.md", DOCS / "method.md", DOCS / "floating-turbine.md")
+PAGES = ("method.md", "optimal-control.md", "floating-turbine.md")
+FILES = (ROOT / "README.md", *(DOCS / name for name in PAGES))
 
 
 def accuracy_table(figures: Mapping[str, Any], variant: str = "multi-fidelity") -> list[str]:
@@ -214,6 +219,99 @@ def adaptive_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def known_table(figures: Mapping[str, Any]) -> list[str]:
+    """Relative error, iterations and seconds of every method on problems with known answers."""
+    methods = {
+        "hermite_simpson": "Hermite–Simpson",
+        "radau": "Radau 3",
+        "multiple_shooting": "multiple shooting",
+    }
+    rows = [
+        (name, f"{found['value']:.10g}", *(_solved(found.get(key)) for key in methods))
+        for name, found in figures.items()
+    ]
+    return Table("known", "", ("problem", "optimum", *methods.values()), _minus(rows)).markdown()
+
+
+def _solved(found: Mapping[str, Any] | None) -> str | None:
+    if found is None:
+        return None
+    if found["ending"] != "SOLVED":
+        return found["ending"].lower().replace("_", " ")
+    error, seconds = cell_text(found["relative_error"], 2), cell_text(found["seconds"], 2)
+    return f"{error}, {found['iterations']}, {seconds} s"
+
+
+def orders_table(figures: Mapping[str, Any]) -> list[str]:
+    """Observed orders; in brackets where the finer error is below the solver's tolerance."""
+    meshes = next(iter(figures.values()))["intervals"]
+    steps = [f"{coarse} → {fine}" for coarse, fine in pairwise(meshes)]
+    rows = []
+    for name, found in figures.items():
+        pairs = zip(found["orders"], found["errors"][1:], strict=True)
+        cells = [
+            f"{order:.2f}" if e > found["tolerance"] else f"({order:.2f})" for order, e in pairs
+        ]
+        label = name.replace("hermite_simpson", "Hermite–Simpson").replace("radau", "Radau")
+        rows.append((label, str(found["theory"]), *cells))
+    return Table("orders", "", ("problem, scheme", "theory", *steps), _minus(rows)).markdown()
+
+
+def control_speed_table(figures: Mapping[str, Any]) -> list[str]:
+    """Time per iteration over the number of points; the last column is 1 where it is linear."""
+    least, first = min((int(n), found["ms_per_iteration"]) for n, found in figures.items())
+    rows = []
+    for count, found in figures.items():
+        points, ms = int(count), found["ms_per_iteration"]
+        growth = f"{points / least:.0f} × the points, {ms / first:.2g} × the time"
+        label = found["iterations"] if found["ending"] == "SOLVED" else found["ending"].lower()
+        rows.append((points, label, ms, 1000 * ms / points, "–" if points == least else growth))
+    columns = ("points", "iterations", "ms per iteration", "ms per iteration per 1000 points")
+    growth = f"against {least} points"
+    return Table("control_speed", "", (*columns, growth), tuple(rows)).markdown()
+
+
+def expressions_table(figures: Mapping[str, Any]) -> list[str]:
+    """The same program by dfsm and in CasADi expressions."""
+    names = {
+        "dfsm": "dfsm, first call",
+        "dfsm, compiled": "dfsm, compiled",
+        "dfsm, warm start": "dfsm, compiled, from its solution",
+        "casadi": "CasADi expressions",
+        "casadi, compiled": "CasADi expressions in C",
+    }
+    reference, rows = figures["ms_per_iteration"]["dfsm"], []
+    for key, name in names.items():
+        found = figures[key]
+        if found is None:
+            continue
+        start, solve = (
+            found.get(a, found.get(b))
+            for a, b in (("seconds_setup", "seconds_compile"), ("seconds_solve", "seconds"))
+        )
+        ms = 1000 * solve / found["iterations"]
+        objective = f"{found['objective']:.4f}"
+        rows.append((name, objective, found["iterations"], start, solve, ms, ms / reference))
+    columns = (
+        "program",
+        "objective",
+        "iterations",
+        "set up, compile (s)",
+        "solve (s)",
+        "ms per iteration",
+        "over dfsm, compiled",
+    )
+    return Table("expressions", "", columns, _minus(rows), digits=2).markdown()
+
+
+def _minus(rows: Sequence[tuple[Any, ...]]) -> tuple[tuple[Any, ...], ...]:
+    """Texts with a minus sign where they have a hyphen before a digit."""
+    return tuple(
+        tuple(re.sub(r"-(?=\d)", "\N{MINUS SIGN}", c) if isinstance(c, str) else c for c in row)
+        for row in rows
+    )
+
+
 TABLES = {
     "accuracy": accuracy_table,
     "speed": speed_table,
@@ -222,8 +320,14 @@ TABLES = {
     "scaling": scaling_table,
 }
 ROLLOUT_TABLES = {"rollouts": rollouts_table, "loads": loads_table, "sweep": sweep_table}
-
 CODESIGN_TABLES = {"codesign": codesign_table, "adaptive": adaptive_table}
+# By the part of the figures that each shows.
+CONTROL_TABLES = {
+    "known": ("known", known_table),
+    "orders": ("orders", orders_table),
+    "control_speed": ("turbine", control_speed_table),
+    "expressions": ("expressions", expressions_table),
+}
 
 
 def fill(path: Path, tables: Mapping[str, list[str]]) -> None:
@@ -248,12 +352,24 @@ def main() -> None:
     if "codesign" in figures:
         for name, table in CODESIGN_TABLES.items():
             tables[name] = table(figures["codesign"])
+    if "control" in figures:
+        for name, (part, table) in CONTROL_TABLES.items():
+            tables[name] = table(figures["control"][part])
     for path in FILES:
         fill(path, tables)
-    if "scaling" in figures:
-        from benchmarks.scaling_figure import draw  # only this needs Matplotlib
+    draw(figures)
 
-        draw(figures["scaling"], ROOT / "docs" / "figures" / "scaling.svg")
+
+def draw(figures: Mapping[str, Any]) -> None:
+    """Draw what the figures hold; only this needs Matplotlib."""
+    if "scaling" in figures:
+        from benchmarks.figures import draw_scaling
+
+        draw_scaling(figures["scaling"], DOCS / "figures" / "scaling.svg")
+    if "control" in figures:
+        from benchmarks.figures import draw_orders
+
+        draw_orders(figures["control"]["orders"], DOCS / "figures" / "orders.svg")
 
 
 if __name__ == "__main__":

@@ -59,13 +59,13 @@ def test_the_table_says_where_nothing_was_corrected():
 
 def test_the_figure_shows_every_kind(tmp_path):
     pytest.importorskip("matplotlib")
-    from benchmarks.scaling_figure import draw
+    from benchmarks.figures import draw_scaling
 
     found = {"derivative": 0.1, "rollout": 0.1, "training_s": 1.0, "evaluation_ratio": None}
     results = dict.fromkeys(KINDS, found) | {scaling.LINEAR: found | {"evaluation_ratio": 1.0}}
     figures = {str(n): {"inputs": n, "results": results} for n in INPUTS}
-    draw(figures, tmp_path / "figure.svg")
+    draw_scaling(figures, tmp_path / "figure.svg")
     drawn = (tmp_path / "figure.svg").read_text(encoding="utf-8")
     assert all(f"<!-- {kind} -->" in drawn for kind in KINDS)
-    draw(figures, tmp_path / "again.svg")
+    draw_scaling(figures, tmp_path / "again.svg")
     assert (tmp_path / "again.svg").read_text(encoding="utf-8") == drawn
