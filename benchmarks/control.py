@@ -215,7 +215,12 @@ def _turbine_model(units: int = 200) -> DFSM:
     offsets[:, 2], offsets[:, 3] = 0.1, 0.03 * winds + 0.6
     middle, half = (_LOW + _HIGH) / 2, (_HIGH - _LOW) / 2
     region = Region(
-        *map(jnp.asarray, (_LOW, _HIGH, middle, half / 2, winds, np.tile(middle, (6, 1))))
+        low=jnp.asarray(_LOW),
+        high=jnp.asarray(_HIGH),
+        mean=jnp.asarray(middle),
+        std=jnp.asarray(half / 2),
+        grid=jnp.asarray(winds),
+        operating=jnp.asarray(np.tile(middle, (6, 1))),
     )
     return DFSM(
         f=LinearModel(jnp.asarray(winds), jnp.asarray(coefficients), jnp.asarray(offsets), 2),

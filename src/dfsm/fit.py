@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from dfsm.correction import correct, destabilised
 from dfsm.corrective import Corrective, NoCorrection, fit_corrective
+from dfsm.density import whiten
 from dfsm.derivatives import kinematic_rows
 from dfsm.errors import DfsmError, DfsmWarning, near_matches
 from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
@@ -303,20 +304,24 @@ def _region(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     # A signal at a limit differs from file to file by its rounding; that is not "outside".
     names = [c.name for c in samples.signals.inputs]
     steps = np.array([(data.channel(n).step or 0.0) if n in data.names else 0.0 for n in names])
-    if model.schedule is None:
-        grid, operating = inputs.mean(axis=0)[:1], inputs.mean(axis=0)[None]
-    else:
-        order = np.argsort(inputs[:, model.schedule], kind="stable")
+    bins, column = [np.arange(len(inputs))], model.schedule
+    if column is not None:
+        order = np.argsort(inputs[:, column], kind="stable")
         bins = np.array_split(order, _OPERATING_POINTS)
-        operating = np.stack([inputs[rows].mean(axis=0) for rows in bins])
-        grid = operating[:, model.schedule]
+    operating = np.stack([inputs[rows].mean(axis=0) for rows in bins])
+    given = (*samples.signals.disturbances, *samples.signals.parameters)
+    fixed = np.array([i for i, n in enumerate(names) if n in {c.name for c in given}], dtype=int)
+    W, reach = whiten(inputs, samples.runs, bins, column, fixed)
     return Region(
         low=jnp.asarray(inputs.min(axis=0) - steps),
         high=jnp.asarray(inputs.max(axis=0) + steps),
         mean=jnp.asarray(inputs.mean(axis=0)),
         std=jnp.asarray(inputs.std(axis=0)),
-        grid=jnp.asarray(grid),
+        grid=jnp.asarray(operating[:, column or 0]),
         operating=jnp.asarray(operating),
+        whitening=jnp.asarray(W / reach),
+        fixed=len(fixed),
+        schedule=column,
     )
 
 

@@ -254,7 +254,7 @@ def _ignoring(corrective: Corrective, at: int, count: int) -> Corrective:
 
 def _with_range(region: Region, at: int, old: int, paths: Sequence[Array]) -> Region:
     """Ranges and moments of the inputs with those of `old` columns from `at` on replaced."""
-    z = np.concatenate(paths)
+    z, W = np.concatenate(paths), region.whitening
     place = np.full(z.shape[1], at)
     gone = slice(at, at + old)
 
@@ -269,4 +269,6 @@ def _with_range(region: Region, at: int, old: int, paths: Sequence[Array]) -> Re
         mean=put(region.mean, z.mean(axis=0)),
         std=put(region.std, z.std(axis=0)),
         operating=put(region.operating, np.tile(z.mean(axis=0), (len(region.grid), 1))),
+        # Latent states follow from what was counted already: they add no distance.
+        whitening=put(W, np.zeros(len(place))) if W.size else W,
     )

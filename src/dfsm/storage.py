@@ -114,6 +114,7 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
         "latents": len(model.signals.latents),
     }
     keep("region", model.region, _REGION)
+    structure["region"] = {"fixed": model.region.fixed, "schedule": model.region.schedule}
     for name, linear in (("f", model.f), ("g", model.g)):
         structure[name] = None
         if linear is not None:
@@ -133,7 +134,8 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
     return structure
 
 
-_REGION = ("low", "high", "mean", "std", "grid", "operating")
+_REGION = ("low", "high", "mean", "std", "grid", "operating", "whitening")
+_NO_DENSITY = np.zeros((0, 0, 0))  # of models that were saved before they had one
 _LINEAR = ("grid", "coefficients", "offsets")
 _GAUSSIAN = ("shift", "scale", "centres", "weights", "bias")
 
@@ -145,8 +147,10 @@ def _put_together(
     signals: SignalTable,
     provenance: Provenance,
 ) -> DFSM:
+    given = {f"{prefix}/region/whitening": _NO_DENSITY, **tensors}
+
     def arrays(name: str, fields: tuple[str, ...]) -> list[Any]:
-        return [jnp.asarray(tensors[f"{prefix}/{name}/{field}"]) for field in fields]
+        return [jnp.asarray(given[f"{prefix}/{name}/{field}"]) for field in fields]
 
     def linear(name: str) -> LinearModel | None:
         found = structure[name]
@@ -180,7 +184,7 @@ def _put_together(
         e=corrective("e"),
         g=linear("g"),
         e_g=corrective("e_g"),
-        region=Region(*arrays("region", _REGION)),
+        region=Region(*arrays("region", _REGION), **structure.get("region", {})),
         corrected=tuple(structure["corrected"]),
         corrected_outputs=tuple(structure["corrected_outputs"]),
         signals=signals,

@@ -41,7 +41,8 @@ class MultipleShooting:
     steps
         RK4 steps in every piece.
     stay_inside
-        Keep states, controls and free parameters inside the training range of a surrogate.
+        Keep states, controls and free parameters inside the training range of a surrogate, and
+        their combinations near what occurred there, see `Region.distance`.
     tolerance
         Of the scaled optimality conditions.
     most_iterations

@@ -135,6 +135,18 @@ class Signals:
         )
 
     @property
+    def distance(self) -> Any:
+        """Squared distance of states and controls from the training data, 1 where it is unusual.
+
+        See `Region.distance`; 0 without a surrogate.
+        """
+        x, u, w, p = self._raw
+        region = self._plant.region
+        if region is None:
+            return jnp.zeros(())
+        return region.distance(jnp.concatenate([u, w, x, p]), chosen=True)
+
+    @property
     def y(self) -> Group:
         """Outputs; they are only evaluated where a function asks for them."""
         return Group("y", self._plant, self._plant.output(*self._raw))

@@ -17,6 +17,7 @@ from dfsm.control.problem import OptimalControlProblem, level
 from dfsm.control.program import Program
 from dfsm.control.replay import replay
 from dfsm.control.shooting import MultipleShooting, Shooting, SingleShooting
+from dfsm.control.signals import Signals
 from dfsm.control.solution import RATE, Ending, Solution
 from dfsm.control.transcription import DirectTranscription, Transcription, node_data
 from dfsm.errors import DfsmError
@@ -79,8 +80,23 @@ def solve(
         by JAX; bounds or settings that contradict each other.
     """
     method = method or DirectTranscription()
+    if method.stay_inside:
+        problem = _kept_inside(problem)
     record = _solve_meshes(problem, method, guess)
     return _solution(problem, record, simulate)
+
+
+def _kept_inside(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with states and controls no farther from the training data than is usual."""
+    region = problem.plant.region
+    if region is None or not region.whitening.size:
+        return problem
+    kept = {"distance from the training data": (_distance, None, 1.0)}
+    return replace(problem, constraints={**problem.constraints, **kept})
+
+
+def _distance(signals: Signals) -> Any:
+    return signals.distance
 
 
 def _solve_meshes(

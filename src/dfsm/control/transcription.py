@@ -46,7 +46,8 @@ class DirectTranscription:
     most_refinements
         Meshes tried after the first.
     stay_inside
-        Keep states, controls and free parameters inside the training range of a surrogate.
+        Keep states, controls and free parameters inside the training range of a surrogate, and
+        their combinations near what occurred there, see `Region.distance`.
     tolerance
         Of the scaled optimality conditions.
     most_iterations

@@ -1,0 +1,100 @@
+"""How far an input vector is from the training data, along the schedule.
+
+A range per input says nothing of combinations: torque and speed may each be usual, and never occur
+together. At every operating point the data have a mean and a covariance; the distance is
+Mahalanobis's, and how large it may be follows from runs that did not enter the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dfsm.types import Array, IntArray
+
+# The distance that this share of the samples keeps, each measured by the data of other runs.
+_SHARE = 0.999
+# Standard deviations of any direction are at least this share of an input's overall one.
+_FLOOR = 1e-2
+
+
+def whiten(
+    inputs: Array, runs: IntArray, bins: Sequence[IntArray], schedule: int | None, first: IntArray
+) -> tuple[Array, float]:
+    """Matrices that turn deviations from the operating points into distances.
+
+    Parameters
+    ----------
+    inputs
+        Training samples, shape ``(sample, input)``.
+    runs
+        Run of every sample, ``(sample,)``.
+    bins
+        Samples of every operating point; one for all without a schedule.
+    schedule
+        Input column that schedules.
+    first
+        Columns that nobody chooses, disturbances and parameters.
+
+    Returns
+    -------
+    tuple
+        Matrices W, shape ``(point, input, input)``, and the largest usual distance. The distance
+        of I at an operating point with mean μ is |W (I − μ)|; its first components depend on the
+        columns in `first` alone.
+    """
+    std = np.where(inputs.std(axis=0) > 0, inputs.std(axis=0), 1.0)
+    z = (inputs - inputs.mean(axis=0)) / std
+    order = np.concatenate([first, np.delete(np.arange(z.shape[1]), first)])
+    groups = _groups(runs)
+    sums = np.array([[_sums(z[b[groups[b] == k]]) for b in bins] for k in np.unique(groups)])
+    total = sums.sum(axis=0)
+    means = total[:, 0, 1:] / total[:, :1, 0]
+    grid = means[:, schedule] if schedule is not None else np.zeros(1)
+    found = []
+    for k in np.unique(groups):
+        mine, others = groups == k, total - sums[k]
+        # A point that only this run has seen is measured by its own data.
+        enough = others[:, 0, 0] > 2 * z.shape[1]
+        used = np.where(enough[:, None, None], others, total)
+        W = np.stack([_whitening(s, order) for s in used])
+        s = z[mine, schedule] if schedule is not None else np.zeros(mine.sum())
+        found.append(distances(z[mine], hats(grid, s), used[:, 0, 1:] / used[:, :1, 0], W))
+    reach = float(np.quantile(np.concatenate(found), _SHARE))
+    return np.stack([_whitening(s, order) for s in total]) / std, reach
+
+
+def hats(grid: Array, schedule: Array) -> Array:
+    """Weights of the operating points, linear between them, shape ``(sample, point)``."""
+    if len(grid) == 1:
+        return np.ones((len(schedule), 1))
+    return np.stack([np.interp(schedule, grid, row) for row in np.eye(len(grid))], axis=1)
+
+
+def distances(inputs: Array, shares: Array, means: Array, W: Array) -> Array:
+    """Root of the weighted squared distances from the operating points, shape ``(sample,)``."""
+    squares = [np.sum(((inputs - m) @ w.T) ** 2, axis=1) for m, w in zip(means, W, strict=True)]
+    return np.sqrt(np.sum(shares * np.stack(squares, axis=1), axis=1))
+
+
+def _groups(runs: IntArray) -> IntArray:
+    """Parts of the data that are judged by the others: runs, or quarters of a single one."""
+    if len(np.unique(runs)) > 1:
+        return runs
+    return np.arange(len(runs)) * 4 // len(runs)
+
+
+def _sums(z: Array) -> Array:
+    """[1, z] products summed up, shape ``(1 + input, 1 + input)``."""
+    wide = np.concatenate([np.ones((len(z), 1)), z], axis=1)
+    return wide.T @ wide
+
+
+def _whitening(sums: Array, order: IntArray) -> Array:
+    """Inverse root of a covariance; row k sees the columns ``order[: k + 1]`` only."""
+    mean = sums[0, 1:] / sums[0, 0]
+    C = sums[1:, 1:] / sums[0, 0] - np.outer(mean, mean) + _FLOOR**2 * np.eye(len(mean))
+    W = np.zeros_like(C)
+    W[:, order] = np.linalg.inv(np.linalg.cholesky(C[np.ix_(order, order)]))
+    return W

@@ -1,0 +1,154 @@
+"""Distances from the training data against their definition, and what follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dfsm.control import DirectTranscription, OptimalControlProblem, solve
+from dfsm.corrective import NoCorrection
+from dfsm.density import hats, whiten
+from dfsm.derivatives import StateSpec
+from dfsm.fit import fit
+from dfsm.linear import LPV, LTI
+from dfsm.samples import FitSettings
+from dfsm.simulate import simulate
+from dfsm.storage import load, save
+from dfsm.trajectory import Channel, Trajectory
+from systems import wander
+
+TIME = np.arange(0, 80.01, 0.1)
+SETTINGS = FitSettings(
+    states=(StateSpec(name="q"),),
+    controls=("u",),
+    disturbances=("w",),
+    linear=LTI(),
+    corrective=NoCorrection(),
+    nonlinear_only=False,
+)
+
+
+def controlled(seed: int) -> Trajectory:
+    """q' = -q + u + w under the law u = -2 q + 0.2 v: u and q hardly vary apart."""
+    rng = np.random.default_rng(seed)
+    w, v = (wander(rng, 0.5, TIME[-1], 2.0)(TIME) for _ in range(2))
+    q = np.zeros(len(TIME))
+    for k in range(len(TIME) - 1):
+        q[k + 1] = q[k] + 0.1 * (-3 * q[k] + 0.2 * v[k] + w[k])
+    channels = (Channel("q", "m"), Channel("u", "N"), Channel("w", "N"))
+    return Trajectory(TIME, np.stack([q, -2 * q + 0.2 * v, w], axis=1), channels, name=f"r{seed}")
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[Trajectory]:
+    return [controlled(seed) for seed in range(8)]
+
+
+@pytest.fixture(scope="module", params=["LTI", "LPV"])
+def model(request, runs):
+    linear = LTI() if request.param == "LTI" else LPV(schedule="w", points=2)
+    return fit(runs, replace(SETTINGS, linear=linear)).model
+
+
+def test_without_a_schedule_it_is_mahalanobis_distance(runs):
+    region = fit(runs, SETTINGS).model.region
+    data = np.concatenate([r.select(["u", "w", "q"]).values for r in runs])
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    C = np.linalg.inv(np.cov(data.T) + 1e-4 * np.diag(data.var(axis=0)))
+    apart = points - data.mean(axis=0)
+    expected = np.einsum("ni,ij,nj->n", apart, C, apart)
+    found = np.asarray(region.distance(points))
+    np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-3)
+
+
+def test_new_runs_are_inside_as_often_as_the_quantile_says(model):
+    shares = [simulate(model, controlled(100 + k)).outside for k in range(10)]
+    assert np.mean(shares) < 0.02
+
+
+def test_combinations_that_never_occurred_are_outside(model):
+    names = [c.name for c in model.signals.inputs]
+    low, high = np.asarray(model.region.low), np.asarray(model.region.high)
+    point = dict(zip(names, (low + high) / 2, strict=True))
+    # Both within their ranges; the law never lets them have the same sign.
+    point |= {"u": 0.7 * high[0], "q": 0.7 * high[2]}
+    inputs = np.array([point[n] for n in names])
+    assert (inputs > low).all()
+    assert (inputs < high).all()
+    assert bool(model.region.outside(inputs))
+    assert float(model.region.distance(inputs)) > 1
+    assert not bool(model.region.outside((low + high) / 2))
+
+
+def test_what_is_chosen_adds_to_what_is_given(model):
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(20, 3))
+    whole, chosen = (np.asarray(model.region.distance(inputs, chosen=c)) for c in (False, True))
+    assert (chosen <= whole + 1e-12).all()
+    # The nearest controls and states to given disturbances add nothing.
+    if model.schedule is None:
+        W, mean = np.asarray(model.region.whitening[0]), np.asarray(model.region.operating[0])
+        w = 0.7
+        rows = W[1:]
+        best = np.linalg.lstsq(rows[:, [0, 2]], -rows[:, 1] * (w - mean[1]), rcond=None)[0]
+        point = np.array([best[0] + mean[0], w, best[1] + mean[2]])
+        assert float(model.region.distance(point, chosen=True)) == pytest.approx(0, abs=1e-12)
+
+
+def test_slopes_are_exact(model):
+    point = jnp.array([0.3, 0.1, -0.4])
+    slopes = jax.grad(model.region.distance)(point)
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        there, here = (float(model.region.distance(point + s)) for s in (step, -step))
+        assert float(slopes[k]) == pytest.approx((there - here) / 2e-6, rel=1e-6, abs=1e-6)
+
+
+def test_it_is_kept(model, tmp_path):
+    save(model, tmp_path / "m")
+    again = load(tmp_path / "m").region
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_array_equal(model.region.distance(points), again.distance(points))
+    assert (again.fixed, again.schedule) == (1, model.f.schedule)
+
+
+def test_an_optimum_stays_near_the_data_if_asked(model):
+    """Pushing q up against the law leaves the data at once."""
+    problem = OptimalControlProblem(
+        model=model,
+        horizon=(0.0, 5.0),
+        disturbances=controlled(50),
+        cost=lambda s: -s.x.q,
+        bounds={"u": (-40.0, 40.0), "q": (-20.0, 20.0)},
+    )
+    free, kept = (
+        solve(problem, DirectTranscription(mesh=20, refine=None, stay_inside=inside))
+        for inside in (False, True)
+    )
+    assert free.solved
+    assert kept.solved
+    assert free.outside > 0.5
+    inputs = kept.trajectory.select(["u", "w", "q"]).values
+    assert np.asarray(model.region.distance(inputs, chosen=True)).max() < 1 + 1e-6
+    assert kept.objective > free.objective
+
+
+def test_a_single_run_is_judged_by_its_quarters(runs):
+    inputs = runs[0].select(["u", "w", "q"]).values
+    zeros = np.zeros(len(inputs), dtype=int)
+    every = [np.arange(len(inputs))]
+    _, reach = whiten(inputs, zeros, every, None, np.array([1]))
+    _, several = whiten(
+        inputs, np.arange(len(inputs)) * 4 // len(inputs), every, None, np.array([1])
+    )
+    assert reach == several
+
+
+def test_hats_add_up_to_one():
+    values = hats(np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.5, 2.0, 9.0]))
+    np.testing.assert_allclose(values.sum(axis=1), 1)
+    np.testing.assert_allclose(values[1], [0.5, 0.5, 0])
