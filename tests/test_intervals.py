@@ -1,21 +1,25 @@
-"""Prediction intervals: coverage on new runs, and what they refuse."""
+"""Prediction intervals: coverage on new runs, their file, and what they refuse."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from dfsm.calibrate import calibrate
 from dfsm.corrective import NoCorrection
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError
 from dfsm.fit import fit
-from dfsm.intervals import calibrate
+from dfsm.intervals import load_intervals
 from dfsm.linear import LPV, LTI
 from dfsm.samples import FitSettings
+from dfsm.signals import Provenance
 from dfsm.simulate import simulate
 from dfsm.trajectory import Channel, Trajectory
+from dfsm.validate import validate
 from systems import wander
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning")
@@ -49,6 +53,11 @@ def model():
     return fit([run(seed) for seed in range(8)], SETTINGS).model
 
 
+@pytest.fixture(scope="module")
+def intervals(model):
+    return calibrate(model, [run(seed) for seed in range(100, 104)])
+
+
 @pytest.mark.parametrize("level", [0.7, 0.9])
 def test_new_runs_lie_inside_as_often_as_promised(model, level):
     found = calibrate(model, [run(seed) for seed in range(100, 160)], level=level)
@@ -71,8 +80,8 @@ def test_few_runs_do_not_make_them_narrow(model):
     assert np.mean(shares) > 0.7
 
 
-def test_ends_lie_around_the_rollout(model):
-    found = calibrate(model, [run(seed) for seed in range(100, 104)])
+def test_ends_lie_around_the_rollout(model, intervals):
+    found = intervals
     new = run(300)
     rollout = simulate(model, new)
     low, high = found.around(rollout, new)
@@ -80,6 +89,11 @@ def test_ends_lie_around_the_rollout(model):
     np.testing.assert_allclose((low.values + high.values) / 2, middle, atol=1e-12)
     assert (high.values > low.values).all()
     assert found.runs == tuple(f"run{k}" for k in range(100, 104))
+    beside = found.beside(rollout, new)
+    assert beside.names == ("q", "y", "q_low", "q_high", "y_low", "y_high")
+    assert beside.channel("y_high").unit == "m"
+    np.testing.assert_array_equal(beside["y_high"], high["y"])
+    np.testing.assert_array_equal(beside["q_low"], low["q"])
 
 
 def test_a_model_without_a_schedule():
@@ -91,7 +105,122 @@ def test_a_model_without_a_schedule():
     assert 0.5 < found.coverage(simulate(model, new), new, new)[0] <= 1
 
 
-def test_bad_input(model):
+def test_a_channel_that_is_always_zero(tmp_path):
+    silent = [replace(r, values=r.values * [1, 1, 0]) for r in map(run, range(12))]
+    found = calibrate(fit(silent[:8], SETTINGS).model, silent[8:])
+    assert found.half_width[:, 1].max() < 1e-12
+    found.save(tmp_path / "i.json")
+    assert (load_intervals(tmp_path / "i.json").half_width == found.half_width).all()
+
+
+def test_a_validation_tells_the_coverage(model, intervals):
+    new = [run(300), run(301)]
+    found = validate(model, new, intervals=intervals)
+    expected = [intervals.coverage(simulate(model, r), r, r) for r in new]
+    assert found.coverage("q") == [share[0] for share in expected]
+    values = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert values["intervals"]["level"] == 0.9
+    assert values["intervals"]["mean_coverage"]["y"] == np.mean(expected, axis=0)[1]
+    own = [r["models"] for r in values["runs"]]
+    assert [m["multi-fidelity"]["coverage"]["y"] for m in own] == [s[1] for s in expected]
+    assert own[0]["linear-fit"]["coverage"] == {}
+    assert found.warnings == ()
+    without = validate(model, new)
+    assert without.coverage("q") is None
+    assert without.to_dict()["intervals"] is None
+
+
+def test_runs_that_are_not_new_are_told(model, intervals):
+    found = calibrate(model, [run(0), run(100), run(101)])
+    (told,) = found.warnings
+    assert "1 of the 3 calibration runs were used in training (run0)" in told
+    notes = validate(model, [run(101), run(300)], intervals=found).warnings
+    assert "1 of the 2 test runs calibrated the intervals (run101)" in notes[0]
+    assert notes[1] == f"intervals: {told}"
+    groups = {"training": [f"run{k}" for k in range(1, 8)], "validation": ["run0"]}
+    record = {**model.provenance.record, "refinement": groups}
+    refined = replace(model, provenance=Provenance(record))
+    (told,) = calibrate(refined, [run(0), run(100), run(101)]).warnings
+    assert "1 of the 3 calibration runs were held out by the refinement" in told
+    # To a test they are training runs, as before.
+    assert "used in training (run0)" in validate(refined, [run(0)]).warnings[0]
+    assert intervals.warnings == ()
+
+
+# -- the file ---------------------------------------------------------------------------------
+
+
+def test_a_file_holds_all_of_it(intervals, tmp_path):
+    path = tmp_path / "i.json"
+    path.write_text("what was there before")
+    given = replace(intervals, warnings=("mind the gap",))
+    given.save(path)
+    found = load_intervals(path)
+    for field in fields(given):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(given, field.name))
+    assert [p.name for p in tmp_path.iterdir()] == ["i.json"]
+    kept = json.loads(path.read_text())["channels"][0]
+    assert (kept["name"], kept["unit"]) == ("q", "m")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (None, "not JSON"),
+        ([], "all of it: "),
+        ({"level": 90}, "level: input should be less than 1"),
+        ({"grid": []}, "grid: "),
+        ({"grid": [2.0, 1.0, 0.0]}, "its grid does not increase"),
+        ({"grid": [0.0, 1.0]}, "has not one half-width for each of 2 grid points"),
+        ({"channels": [{"name": "q", "unit": "m"}]}, "channels.0.half_width: field required"),
+        ({"channels": [{"name": "q", "unit": "m", "half_width": [-1.0] * 3}]}, "greater than or"),
+        ({"channels": [{"name": "q", "unit": "m", "half_width": [None] * 3}]}, "valid number"),
+    ],
+)
+def test_foreign_files_are_refused(intervals, tmp_path, change, match):
+    path = tmp_path / "i.json"
+    intervals.save(path)
+    content = json.loads(path.read_text())
+    content = content | change if isinstance(change, dict) else change
+    path.write_text("{" if content is None else json.dumps(content))
+    with pytest.raises(DfsmError, match="is no file of prediction intervals") as error:
+        load_intervals(path)
+    assert match in str(error.value)
+    assert str(error.value).endswith("make it again with dfsm calibrate")
+
+
+def test_missing_and_newer_files_are_refused(intervals, tmp_path):
+    with pytest.raises(DfsmError, match="no such file"):
+        load_intervals(tmp_path / "i.json")
+    (tmp_path / "i.json").write_text('{"format": 2}')
+    with pytest.raises(DfsmError, match=r"has format 2, this dfsm .* reads up to 1"):
+        load_intervals(tmp_path / "i.json")
+    with pytest.raises(DfsmError, match="could not be written"):
+        intervals.save(tmp_path / "missing" / "i.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"channels": ("q", "z")}, r"channels are q \(m\), z \(m\), the model's q \(m\), y \(m\)"),
+        ({"units": ("m", "km")}, r"channels are q \(m\), y \(km\)"),
+        ({"schedule": None}, "schedule is none, the model's w"),
+        ({"grid": np.array([0.0, 1.0, 2.0])}, "schedule points are 0, 1, 2, the model's "),
+    ],
+)
+def test_intervals_of_another_model_are_refused(model, intervals, change, match):
+    with pytest.raises(DfsmError, match=f"of another model: their {match}"):
+        validate(model, [run(300)], intervals=replace(intervals, **change))
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+def test_bad_input(model, intervals):
+    with pytest.raises(DfsmError, match=r"run1 and run1 hold the same data"):
+        calibrate(model, [run(1), run(1), run(2)])
+    with pytest.raises(DfsmError, match="the model 'multi-fidelity', but the models are mine"):
+        validate({"mine": model}, [run(300)], intervals=intervals)
     with pytest.raises(DfsmError, match="at least 3 runs, 2 were given"):
         calibrate(model, [run(1), run(2)])
     with pytest.raises(DfsmError, match=r"level is 1.5, expected a share between 0 and 1"):

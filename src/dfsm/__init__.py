@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from dfsm.calibrate import calibrate
     from dfsm.compare import RankedCandidate, Ranking, compare
     from dfsm.config import load_config
     from dfsm.control import (
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from dfsm.export import RoscoInput, write_rosco
     from dfsm.features import Feature
     from dfsm.fit import FitResult, fit
-    from dfsm.intervals import Intervals, calibrate
+    from dfsm.intervals import Intervals, load_intervals
     from dfsm.linear import LPV, LTI
     from dfsm.model import DFSM
     from dfsm.progress import show_progress
@@ -127,8 +128,9 @@ _HOME = {
     "RankedCandidate": "compare",
     "Ranking": "compare",
     "compare": "compare",
-    "calibrate": "intervals",
+    "calibrate": "calibrate",
     "Intervals": "intervals",
+    "load_intervals": "intervals",
     "OptimalControlProblem": "control",
     "DirectTranscription": "control",
     "MultipleShooting": "control",

@@ -10,11 +10,15 @@ import numpy as np
 
 from dfsm.errors import printable
 from dfsm.files import json_value
+from dfsm.intervals import Intervals
 from dfsm.model import DFSM
 from dfsm.simulate import MUCH_OUTSIDE, Simulation, Status
 from dfsm.spectra import Spectrum
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.types import Array, ComplexArray
+
+# The model that prediction intervals belong to, among those compared.
+MULTI_FIDELITY = "multi-fidelity"
 
 
 @dataclass(frozen=True)
@@ -74,12 +78,17 @@ class ModelRun:
         Per channel; empty for a rollout that ended early, whose figures would flatter it.
     derivative_errors
         NRMSE of each state derivative along the recorded trajectory, by state name.
+    band, coverage
+        Lower and upper ends of prediction intervals, and per channel the share of the time that
+        the record lies between them; only where intervals were given and the rollout completed.
     """
 
     simulation: Simulation
     errors: Mapping[str, ChannelError]
     statistics: Mapping[str, ChannelStatistics]
     derivative_errors: Mapping[str, float]
+    band: tuple[Trajectory, Trajectory] | None = None
+    coverage: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -132,6 +141,8 @@ class Validation:
         Provenance of the model: settings, data, rows, seconds.
     warnings
         What a reader should know before trusting the figures.
+    intervals
+        Prediction intervals of the multi-fidelity model, if given.
     """
 
     models: Mapping[str, DFSM]
@@ -141,6 +152,7 @@ class Validation:
     eigenvalues: Sequence[tuple[float, ComplexArray]]
     record: Mapping[str, Any]
     warnings: tuple[str, ...] = field(default=())
+    intervals: Intervals | None = None
 
     def __repr__(self) -> str:
         runs = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
@@ -164,6 +176,14 @@ class Validation:
         found = [r.models[model].errors.get(channel) for r in self.runs]
         values = [getattr(e, what) for e in found if e is not None]
         return float(np.mean(values)) if len(values) == len(self.runs) else None
+
+    def coverage(self, channel: str) -> list[float] | None:
+        """Share of the time inside the prediction intervals per run; None as for `mean_nrmse`."""
+        if self.intervals is None:
+            return None
+        found = [r.models[MULTI_FIDELITY].coverage.get(channel) for r in self.runs]
+        shares = [share for share in found if share is not None]
+        return shares if len(shares) == len(self.runs) else None
 
     def endings(self) -> list[str]:
         """One sentence per rollout that ended early."""
@@ -222,8 +242,17 @@ class Validation:
             ],
             "warnings": list(self.warnings),
             "provenance": self.record,
+            "intervals": self._intervals_dict(),
         }
         return dict(json_value(values))
+
+    def _intervals_dict(self) -> dict[str, Any] | None:
+        if self.intervals is None:
+            return None
+        shares = {c.name: self.coverage(c.name) for c in self.channels}
+        means = {name: float(np.mean(s)) if s else None for name, s in shares.items()}
+        level, runs = self.intervals.level, self.intervals.runs
+        return {"level": level, "runs": runs, "mean_coverage": means}
 
     def _model_dict(self, name: str) -> dict[str, Any]:
         return {
@@ -265,6 +294,7 @@ def _run_dict(run: RunComparison) -> dict[str, Any]:
                 "wall_time_s": m.simulation.wall_time,
                 "errors": {c: asdict(e) for c, e in m.errors.items()},
                 "derivative_nrmse": dict(m.derivative_errors),
+                "coverage": dict(m.coverage),
                 "statistics": statistics(m.statistics),
             }
             for name, m in run.models.items()

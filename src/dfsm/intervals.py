@@ -1,28 +1,29 @@
-"""Intervals around rollouts, calibrated on runs that the model never saw.
+"""Prediction intervals around rollouts, and the readable file that keeps them.
 
-How wrong a rollout is depends on the wind: half-widths follow the schedule. At every operating
-point they are a multiple of the root mean square error there; the multiple is the quantile of the
-errors of each calibration run relative to what the other runs give, so that no run is judged by a
-scale that it set itself (conformal prediction with one run left out; Barber et al. 2021).
+How wrong a rollout is depends on the wind: half-widths follow the schedule. `calibrate` finds them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
+import dfsm
 from dfsm.errors import DfsmError
+from dfsm.files import write_json
 from dfsm.model import DFSM
-from dfsm.settings import require
-from dfsm.simulate import Simulation, SimulationSettings, Status
-from dfsm.trajectory import Trajectory
+from dfsm.read.assemble import existing_file
+from dfsm.simulate import Simulation
+from dfsm.trajectory import Channel, Trajectory, labels
 from dfsm.types import Array
-from dfsm.validate import validate
 
-# Calibration runs below which a quantile over runs means nothing.
-_FEWEST = 3
+_FORMAT = 1
+_AGAIN = "make it again with dfsm calibrate"
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,8 @@ class Intervals:
 
     Attributes
     ----------
-    channels
-        States and outputs.
+    channels, units
+        Names and units of states and outputs.
     schedule
         Channel that the half-widths depend on; None for an LTI model.
     grid
@@ -41,16 +42,45 @@ class Intervals:
         Shape ``(point, channel)``, in the channels' units.
     level
         Share of the time that the record of a new run is expected inside.
-    runs
-        Names of the calibration runs.
+    runs, digests
+        Names of the calibration runs, and SHA-256 of what the model reads of them.
+    warnings
+        What a reader should know before trusting them.
     """
 
     channels: tuple[str, ...]
+    units: tuple[str, ...]
     schedule: str | None
     grid: Array
     half_width: Array
     level: float
     runs: tuple[str, ...]
+    digests: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+    def check(self, model: DFSM) -> None:
+        """Refuse to stand around rollouts of another model.
+
+        Raises
+        ------
+        DfsmError
+            The model has other channels, units or schedule points.
+        """
+        s, named = model.signals, zip(self.channels, self.units, strict=True)
+        ours, theirs = tuple(Channel(*c) for c in named), (*s.observed, *s.outputs)
+        grid = np.asarray(model.region.grid)
+        if [(c.name, c.unit) for c in ours] != [(c.name, c.unit) for c in theirs]:
+            what, ours, theirs = "channels are", labels(ours), labels(theirs)
+        elif self.schedule != model.schedule:
+            what, ours, theirs = "schedule is", self.schedule or "none", model.schedule or "none"
+        elif not np.array_equal(self.grid, grid):
+            what, ours, theirs = "schedule points are", _points(self.grid), _points(grid)
+        else:
+            return
+        raise DfsmError(
+            f"the intervals are of another model: their {what} {ours}, the model's {theirs}; "
+            "make them for this one with dfsm calibrate"
+        )
 
     def around(self, rollout: Simulation, run: Trajectory) -> tuple[Trajectory, Trajectory]:
         """Lower and upper ends around a rollout.
@@ -63,12 +93,25 @@ class Intervals:
             What drove it; holds the schedule.
         """
         middle = rollout.trajectory.select(self.channels)
-        half = _interpolated(self.grid, self.half_width, _schedule(self.schedule, run, middle))
+        half = interpolated(self.grid, self.half_width, schedule_along(self.schedule, run, middle))
         low, high = (
             Trajectory(middle.time, middle.values + sign * half, middle.channels, name=run.name)
             for sign in (-1, 1)
         )
         return low, high
+
+    def beside(self, rollout: Simulation, run: Trajectory) -> Trajectory:
+        """The rollout and its ends, as channels ``<channel>_low`` and ``<channel>_high``.
+
+        Parameters
+        ----------
+        rollout, run
+            As for `around`.
+        """
+        low, high = self.around(rollout, run)
+        ends = [Channel(f"{c.name}_{e}", c.unit) for c in low.channels for e in ("low", "high")]
+        values = np.stack([low.values, high.values], axis=2).reshape(len(low), -1)
+        return rollout.trajectory.with_channels(ends, values)
 
     def coverage(self, rollout: Simulation, run: Trajectory, recorded: Trajectory) -> Array:
         """Share of the samples whose recorded value lies inside, shape ``(channel,)``."""
@@ -76,30 +119,58 @@ class Intervals:
         truth = recorded.select(self.channels).values[: len(low)]
         return ((truth >= low) & (truth <= high)).mean(axis=0)
 
+    def save(self, path: str | Path) -> None:
+        """Write a JSON file; an existing one is replaced when the new one is complete.
 
-def calibrate(
-    model: DFSM,
-    runs: Iterable[Trajectory],
-    *,
-    level: float = 0.9,
-    start: float | None = None,
-    stop: float | None = None,
-    options: SimulationSettings | None = None,
-) -> Intervals:
-    """Find intervals that hold the record of a new run for a given share of the time.
+        Raises
+        ------
+        DfsmError
+            The file cannot be written.
+        """
+        named = zip(self.channels, self.units, self.half_width.T.tolist(), strict=True)
+        runs = zip(self.runs, self.digests, strict=True)
+        content = {
+            "format": _FORMAT,
+            "dfsm": dfsm.__version__,
+            "level": self.level,
+            "schedule": self.schedule,
+            "grid": self.grid.tolist(),
+            "channels": [{"name": n, "unit": u, "half_width": h} for n, u, h in named],
+            "runs": [{"name": name, "sha256": digest} for name, digest in runs],
+            "warnings": self.warnings,
+        }
+        write_json(path, content)
+
+
+class _Channel(BaseModel):
+    name: str
+    unit: str
+    half_width: list[Annotated[float, Field(ge=0, allow_inf_nan=False)]]
+
+
+class _Run(BaseModel):
+    name: str
+    sha256: str
+
+
+class _File(BaseModel):
+    """What `Intervals.save` writes."""
+
+    level: Annotated[float, Field(gt=0, lt=1)]
+    schedule: str | None
+    grid: Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=1)]
+    channels: Annotated[list[_Channel], Field(min_length=1)]
+    runs: list[_Run]
+    warnings: list[str]
+
+
+def load_intervals(path: str | Path) -> Intervals:
+    """Read intervals that `Intervals.save` or ``dfsm calibrate`` wrote.
 
     Parameters
     ----------
-    model
-        The surrogate.
-    runs
-        Runs that had no part in its fit, with all its channels; at least three.
-    level
-        Share of the time.
-    start, stop
-        Window in s, as for `validate`.
-    options
-        How the model is simulated.
+    path
+        JSON file.
 
     Returns
     -------
@@ -108,60 +179,59 @@ def calibrate(
     Raises
     ------
     DfsmError
-        Too few runs, a rollout that ended early, or a level outside (0, 1).
+        The file is missing, holds something else, or was written by a newer version.
     """
-    require(0 < level < 1, "level", level, "a share between 0 and 1")
-    runs = list(runs)
-    if len(runs) < _FEWEST:
+    path = existing_file(path)
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        raise _foreign(path, "not JSON") from None
+    version = raw.get("format") if isinstance(raw, dict) else None
+    if isinstance(version, int) and version > _FORMAT:
         raise DfsmError(
-            f"intervals are calibrated on at least {_FEWEST} runs, {len(runs)} were given"
+            f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to {_FORMAT}: "
+            "upgrade with pip install -U dfsm"
         )
-    found = validate({"model": model}, runs, start=start, stop=stop, options=options)
-    errors, schedules = [], []
-    for run, compared in zip(runs, found.runs, strict=True):
-        rollout = compared.models["model"].simulation
-        if rollout.status is not Status.COMPLETED:
-            raise DfsmError(f"{run.where}: {rollout.message}; no interval holds such a rollout")
-        names = [c.name for c in found.channels]
-        truth = compared.recorded.select(names).values
-        errors.append(rollout.trajectory.select(names).values - truth)
-        schedules.append(_schedule(model.schedule, run, rollout.trajectory))
-    grid = np.asarray(model.region.grid)
-    squares = [_sums(grid, s, e**2) for s, e in zip(schedules, errors, strict=True)]
-    scores = []
-    for k, (s, e) in enumerate(zip(schedules, errors, strict=True)):
-        scale = _scale([q for j, q in enumerate(squares) if j != k])
-        scores.append(np.abs(e) / _interpolated(grid, scale, s))
-    multiple = np.quantile(np.concatenate(scores), level, axis=0)
+    try:
+        found = _File.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise _foreign(path, f"{where or 'all of it'}: {first['msg'].lower()}") from None
+    if not (np.diff(found.grid) > 0).all():
+        raise _foreign(path, "its grid does not increase")
+    points = len(found.grid)
+    if any(len(c.half_width) != points for c in found.channels):
+        raise _foreign(path, f"a channel has not one half-width for each of {points} grid points")
     return Intervals(
         channels=tuple(c.name for c in found.channels),
-        schedule=model.schedule,
-        grid=grid,
-        half_width=multiple * _scale(squares),
-        level=level,
-        runs=tuple(r.name for r in runs),
+        units=tuple(c.unit for c in found.channels),
+        schedule=found.schedule,
+        grid=np.array(found.grid),
+        half_width=np.array([c.half_width for c in found.channels]).T,
+        level=found.level,
+        runs=tuple(r.name for r in found.runs),
+        digests=tuple(r.sha256 for r in found.runs),
+        warnings=tuple(found.warnings),
     )
 
 
-def _schedule(name: str | None, run: Trajectory, on: Trajectory) -> Array:
+def _foreign(path: Path, what: str) -> DfsmError:
+    return DfsmError(f"{path} is no file of prediction intervals ({what}): {_AGAIN}")
+
+
+def _points(grid: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in grid)
+
+
+def schedule_along(name: str | None, run: Trajectory, on: Trajectory) -> Array:
     """The schedule at the times of a rollout; zeros without one."""
-    return np.zeros(len(on)) if name is None else np.interp(on.time, run.time, run[name])
+    if name is None:
+        return np.zeros(len(on))
+    # A state may schedule, and be one that no channel of the run holds.
+    return on[name] if name in on else np.interp(on.time, run.time, run[name])
 
 
-def _interpolated(grid: Array, values: Array, at: Array) -> Array:
+def interpolated(grid: Array, values: Array, at: Array) -> Array:
     """Columns of ``(point, channel)`` values at schedule values, ends held."""
     return np.stack([np.interp(at, grid, column) for column in values.T], axis=1)
-
-
-def _sums(grid: Array, schedule: Array, squares: Array) -> tuple[Array, Array]:
-    """Weight ``(point,)`` and weighted sum of squared errors ``(point, channel)`` of one run."""
-    hats = np.stack([np.interp(schedule, grid, row) for row in np.eye(len(grid))])
-    return hats.sum(axis=1), hats @ squares
-
-
-def _scale(sums: Sequence[tuple[Array, Array]]) -> Array:
-    """Root mean square error at every point; that of all where no run has been."""
-    weight, total = (np.sum([s[k] for s in sums], axis=0) for k in (0, 1))
-    overall = total.sum(axis=0) / weight.sum()
-    # As good as a sample of the overall error: a point that was hardly visited leans on the rest.
-    return np.sqrt((total + overall) / (weight + 1)[:, None])

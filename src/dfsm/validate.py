@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
 from dfsm.comparison import (
+    MULTI_FIDELITY,
     ChannelError,
     ChannelStatistics,
     Histogram,
@@ -22,6 +24,7 @@ from dfsm.comparison import (
 from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.intervals import Intervals
 from dfsm.latents import latent_path
 from dfsm.model import DFSM
 from dfsm.progress import track
@@ -47,6 +50,7 @@ def validate(
     start: float | None = None,
     stop: float | None = None,
     options: SimulationSettings | None = None,
+    intervals: Intervals | None = None,
 ) -> Validation:
     """Compare models with recorded test runs.
 
@@ -61,6 +65,8 @@ def validate(
         Test window in s. What lies before `start` only serves to find the initial rates.
     options
         How the models are simulated.
+    intervals
+        Prediction intervals of the model named ``"multi-fidelity"``, as for one model alone.
 
     Returns
     -------
@@ -69,20 +75,27 @@ def validate(
     Raises
     ------
     DfsmError
-        No runs, or a channel that a run lacks.
+        No runs, a channel that a run lacks, or intervals of another model.
     """
     if isinstance(models, DFSM):
         models = compared(models)
     first = next(iter(models.values()))
+    if intervals is not None:
+        if MULTI_FIDELITY not in models:
+            raise DfsmError(
+                f"the intervals are of the model '{MULTI_FIDELITY}', but the models are "
+                f"{', '.join(models)}: give it that name, or leave the intervals out"
+            )
+        intervals.check(models[MULTI_FIDELITY])
     runs = [with_computed(r, first.signals.hub_height, first.signals.features) for r in runs]
     if not runs:
         raise DfsmError("no test runs were given, at least one is needed")
     for run in runs:
         run.columns(first.signals.recorded)
-    notes = _leaks(first, runs)
+    notes = _leaks(first, runs, intervals)
     results = []
     for run in track(runs, "test runs"):
-        results.append(_compare(models, run, (start, stop), options))
+        results.append(_compare(models, run, (start, stop), options, intervals))
     channels = (*first.signals.observed, *first.signals.outputs)
     return Validation(
         models=dict(models),
@@ -92,6 +105,7 @@ def validate(
         eigenvalues=first.eigenvalues(),
         record=first.provenance.record,
         warnings=tuple(notes),
+        intervals=intervals,
     )
 
 
@@ -105,7 +119,7 @@ def compared(model: DFSM, nonlinear: DFSM | None = None) -> dict[str, DFSM]:
     nonlinear
         The nonlinear-only model, if there is one.
     """
-    found = {"linear-fit": model.linear_fit(), "multi-fidelity": model}
+    found = {"linear-fit": model.linear_fit(), MULTI_FIDELITY: model}
     if nonlinear is not None:
         found["nonlinear-only"] = nonlinear
     return found
@@ -116,6 +130,7 @@ def _compare(
     run: Trajectory,
     window: tuple[float | None, float | None],
     options: SimulationSettings | None,
+    intervals: Intervals | None,
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
@@ -133,15 +148,22 @@ def _compare(
         predicted = np.asarray(model.derivative(states, u, w, p))[:, : len(s.observed)]
         errors: dict[str, ChannelError] = {}
         statistics: dict[str, ChannelStatistics] = {}
+        band, coverage = None, {}
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
                 errors[c.name] = _error(simulation.trajectory[c.name], recorded[c.name])
             statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
+            if intervals is not None and name == MULTI_FIDELITY:
+                band = intervals.around(simulation, run)
+                shares = intervals.coverage(simulation, run, recorded)
+                coverage = dict(zip(intervals.channels, shares.tolist(), strict=True))
         results[name] = ModelRun(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
             derivative_errors=_derivative_errors(first, predicted, found.derivatives[rows]),
+            band=band,
+            coverage=coverage,
         )
     return RunComparison(
         recorded=recorded,
@@ -267,16 +289,44 @@ def _histogram(runs: Sequence[RunComparison], channel: str, models: Sequence[str
     return Histogram(edges, counts)
 
 
-def _leaks(model: DFSM, runs: Sequence[Trajectory]) -> list[str]:
-    """Test runs that were in the training data."""
+def parts_in_fit(
+    model: DFSM, runs: Sequence[Trajectory]
+) -> list[Literal["fitted", "held out"] | None]:
+    """What each run was to the fit; held out by the refinement counts where nothing else does."""
     record = model.provenance.record
-    names, trained = record.get("channels", []), {d["sha256"] for d in record.get("data", [])}
-    seen = [
-        r.where for r in runs if all(n in r for n in names) and r.select(names).digest in trained
-    ]
-    if not seen:
-        return []
-    return [
-        f"{len(seen)} of the {len(runs)} test runs were used in training ({', '.join(seen[:3])}"
-        f"{', …' if len(seen) > 3 else ''}): their errors say little about new runs"
-    ]
+    names, groups = record.get("channels", []), record.get("refinement", {})
+    # A name that stands in both groups is of two runs, which the record cannot tell apart.
+    spared = {*groups.get("validation", ())} - {*groups.get("training", ())}
+    trained = {d["sha256"]: d["name"] for d in record.get("data", [])}
+    parts: list[Literal["fitted", "held out"] | None] = []
+    for run in runs:
+        whole = all(n in run for n in names)
+        name = trained.get(run.select(names).digest) if whole else None
+        parts.append(None if name is None else "held out" if name in spared else "fitted")
+    return parts
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first three names, for a sentence."""
+    return ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+
+
+def _leaks(model: DFSM, runs: Sequence[Trajectory], intervals: Intervals | None) -> list[str]:
+    """Test runs that were in the training data, or that intervals were calibrated on."""
+    parts, notes = parts_in_fit(model, runs), []
+    seen = [r.where for r, part in zip(runs, parts, strict=True) if part is not None]
+    if seen:
+        notes.append(
+            f"{len(seen)} of the {len(runs)} test runs were used in training ({listed(seen)}): "
+            "their errors say little about new runs"
+        )
+    if intervals is None:
+        return notes
+    recorded = model.signals.recorded
+    used = [r.where for r in runs if r.select(recorded).digest in intervals.digests]
+    if used:
+        notes.append(
+            f"{len(used)} of the {len(runs)} test runs calibrated the intervals ({listed(used)}): "
+            "how often they lie inside says little about new runs"
+        )
+    return [*notes, *(f"intervals: {text}" for text in intervals.warnings)]
