@@ -17,6 +17,7 @@ from dfsm.corrective import RBF
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError
 from dfsm.fit import fit
+from dfsm.intervals import Intervals
 from dfsm.linear import LTI
 from dfsm.report import write_report
 from dfsm.report.document import embed
@@ -255,6 +256,42 @@ def test_incomplete_rollouts_are_told_and_not_scored(page):
     assert value(load[4]) > 0
 
 
+def test_prediction_intervals_are_drawn_and_told(validation, broken, page, tmp_path):
+    assert "prediction intervals" not in page.text
+    assert ("span", "class", "patch interval") not in page.attributes
+    plain = [v for r in page.data["models"][0]["runs"] for v in r["variants"].values()]
+    assert not [v for v in plain if "band" in v]
+    model = validation.models["multi-fidelity"]
+    names, half = tuple(c.name for c in validation.channels), np.array([[0.05, 0.1, 0.2]])
+    units = tuple(c.unit for c in validation.channels)
+    grid = np.asarray(model.region.grid)
+    given = Intervals(names, units, None, grid, half, 0.8, ("c1", "c2", "c3"), ("", "", ""))
+    tests = [oscillator(i, f"test {i}") for i in (7, 8)]
+    found = validate(validation.models, tests, start=5.0, intervals=given)
+    ended = replace(broken, intervals=given)
+    write_report({"calm": found, "broken": ended, "plain": validation}, tmp_path / "r.html")
+    shaded = Page(tmp_path / "r.html")
+    assert "a new run is expected 80 % of the time, calibrated on 3 runs" in shaded.text
+    run = shaded.data["models"][0]["runs"][0]
+    assert [name for name, v in run["variants"].items() if "band" in v] == ["multi-fidelity"]
+    drawn = run["variants"]["multi-fidelity"]
+
+    def curve(series, channel):
+        blob = shaded.data["blobs"][series["y"][channel]]
+        return np.frombuffer(base64.b64decode(blob), "<f4")
+
+    for channel, width in enumerate(half[0]):
+        low, high = (curve(end, channel) for end in drawn["band"])
+        np.testing.assert_allclose(high - low, 2 * width, atol=1e-5)
+        np.testing.assert_allclose((high + low) / 2, curve(drawn, channel), atol=1e-5)
+    calm, runaway = shaded.rows("Channel", "Unit", "smallest")
+    for row, c in zip(calm, validation.channels, strict=True):
+        shares = found.coverage(c.name)
+        figures = (np.mean(shares), min(shares), max(shares))
+        assert row[4:] == ["80 %", *(f"{100 * share:.1f} %" for share in figures)]
+    assert all(row[4:] == ["80 %", "—", "—", "—"] for row in runaway)
+
+
 def test_nothing_is_fetched(page):
     assert not [a for a in page.attributes if a[1] in ("src", "href", "srcset", "data", "action")]
     assert not {"link", "img", "iframe", "object", "base", "a"} & set(page.tags)
@@ -336,6 +373,22 @@ def test_embedded_json_is_inert_and_intact():
     given = {"</script>": "<!--&\u2028\u2029"}
     assert not re.search("[<>&\u2028\u2029]", embed(given))
     assert json.loads(embed(given)) == given
+
+
+def test_the_terminal_shows_coverage_where_it_is_known(validation, capsys):
+    names, units = zip(*((c.name, c.unit) for c in validation.channels), strict=True)
+    grid = np.asarray(validation.models["multi-fidelity"].region.grid)
+    given = Intervals(names, units, None, grid, np.ones((1, 3)), 0.875, ("c",), ("",))
+    runs = []
+    for share, r in zip((0.5, 0.75), validation.runs, strict=True):
+        covered = replace(r.models["multi-fidelity"], coverage={STATE: share})
+        runs.append(replace(r, models={**r.models, "multi-fidelity": covered}))
+    found = replace(validation, intervals=given, runs=tuple(runs))
+    print_validations({"shaded": found, "plain": validation})
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert next(r for r in rows if r and r[0] == "model")[-2:] == ["inside*", "promised"]
+    assert next(r for r in rows if r and r[0] == "shaded")[-4:] == ["62.5", "%", "87.5", "%"]
+    assert next(r for r in rows if r and r[0] == "plain")[-1] != "%"
 
 
 def test_the_terminal_leaves_out_what_was_not_fitted(validation, capsys):

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dfsm.cli_control import check_run, export_rosco
+from dfsm.cli_intervals import calibrate
 from dfsm.cli_optimize import optimize
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.progress import show_progress
-from dfsm.terminal import AsJson, Files, Quiet, lines, print_json, say, working
+from dfsm.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
 
 if TYPE_CHECKING:
     from dfsm.simulate import Simulation
@@ -38,6 +39,11 @@ app.add_typer(demos, name="demo")
 app.command()(optimize)
 app.command("export-rosco")(export_rosco)
 app.command("check-run")(check_run)
+app.command()(calibrate)
+
+IntervalFile = Annotated[
+    Path | None, typer.Option("--intervals", help="Prediction intervals made by dfsm calibrate.")
+]
 
 
 @app.command()
@@ -173,11 +179,13 @@ def validate(
         float | None, typer.Option(help="Start of the test window in s; default as in the fit.")
     ] = None,
     stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
+    intervals: IntervalFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate test runs, compare with what was recorded, write a report."""
     from dfsm.console import print_validation
     from dfsm.files import check_file, write_json
+    from dfsm.intervals import load_intervals
     from dfsm.read import read_all, with_wall_times
     from dfsm.report import write_report
     from dfsm.storage import NONLINEAR, load_all
@@ -189,16 +197,16 @@ def validate(
         check_file(path)
     models = load_all(model)
     main = next(iter(models.values()))
-    settings = main.provenance.record.get("settings", {})
-    start = settings.get("start") if start is None else start
+    start = fit_start(main) if start is None else start
+    given = None if intervals is None else load_intervals(intervals)
     with working(quiet):
         runs = read_all(files)
         for path in targets:
-            check_file(path, [wall_times, *(r.source for r in runs)])
+            check_file(path, [wall_times, intervals, *(r.source for r in runs)])
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
-        found = run_validate(candidates, runs, start=start, stop=stop)
+        found = run_validate(candidates, runs, start=start, stop=stop, intervals=given)
         if output is not None:
             write_report({model.name or str(model): found}, output)
     if metrics is not None:
@@ -221,13 +229,16 @@ def simulate(
     step: Annotated[
         float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
     ] = None,
+    intervals: IntervalFile = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate the model with the inputs of one run and write states and outputs."""
     from dfsm.files import check_file
+    from dfsm.intervals import load_intervals
     from dfsm.read import read, write_table
     from dfsm.read.tables import table_suffix
+    from dfsm.signals import with_computed
     from dfsm.simulate import METHODS, SimulationSettings
     from dfsm.simulate import simulate as run_simulate
     from dfsm.storage import load
@@ -235,20 +246,24 @@ def simulate(
     if method not in METHODS:
         raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
     table_suffix(output)
-    check_file(output, [run] if Path(run).exists() else [])
+    check_file(output, [path for path in (run, intervals) if path and Path(path).exists()])
     surrogate = load(model)
-    settings = surrogate.provenance.record.get("settings", {})
-    start = settings.get("start") if start is None else start
+    start = fit_start(surrogate) if start is None else start
+    given = None if intervals is None else load_intervals(intervals)
+    if given is not None:
+        given.check(surrogate)
     with working(quiet), warnings.catch_warnings():
         warnings.simplefilter("ignore", DfsmWarning)  # the outcome is printed below
+        signals = surrogate.signals
+        recorded = with_computed(read(run), signals.hub_height, signals.features)
         result = run_simulate(
             surrogate,
-            read(run),
+            recorded,
             start=start,
             stop=stop,
             options=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
         )
-    write_table(result.trajectory, output)
+    write_table(result.trajectory if given is None else given.beside(result, recorded), output)
     if as_json:
         print_json(
             {

@@ -14,6 +14,7 @@ from dfsm.errors import printable
 if TYPE_CHECKING:
     from dfsm.compare import Ranking
     from dfsm.control.check import RunCheck
+    from dfsm.intervals import Intervals
     from dfsm.read.info import RunInfo
     from dfsm.report.article import Article
     from dfsm.validate import Validation
@@ -59,7 +60,9 @@ def print_validations(found: Mapping[str, Validation]) -> None:
     console = _console()
     variants = list(dict.fromkeys(v for validation in found.values() for v in validation.models))
     several = len(found) > 1
-    table = _table(*(["model"] if several else []), "channel", "unit", *variants, "RMSE*", "max*")
+    inside = any(v.intervals is not None for v in found.values())
+    heads = ["model"] * several + ["channel", "unit", *variants, "RMSE*", "max*"]
+    table = _table(*heads, *["inside*", "promised"] * inside)
     for label, validation in found.items():
         for i, c in enumerate(validation.channels):
             row: list[str | Text] = [_text(label if i == 0 else "")] if several else []
@@ -71,6 +74,8 @@ def print_validations(found: Mapping[str, Validation]) -> None:
                 _figure(validation.mean_error("multi-fidelity", c.name, what), ".4g")
                 for what in ("rmse", "maximum")
             ]
+            if inside:
+                row += _inside(validation, c.name)
             table.add_row(*row, end_section=i == len(validation.channels) - 1)
     for label, validation in found.items():
         prefix = f"{label}: " if several else ""
@@ -83,6 +88,8 @@ def print_validations(found: Mapping[str, Validation]) -> None:
     console.print(
         "* of the multi-fidelity model, in the channel's unit; – no mean, a rollout ended early"
     )
+    if inside:
+        console.print("inside: share of the time that the record lies in the prediction intervals")
     times = _table(
         *(["model"] if several else []), "variant", "rollouts done", "wall time", "speed-up"
     )
@@ -102,6 +109,20 @@ def print_validations(found: Mapping[str, Validation]) -> None:
         prefix = f"{label}: " if several else ""
         for text in (*validation.endings(), *validation.outside()):
             console.print(_text(f"{prefix}{text}"))
+
+
+def print_intervals(found: Intervals) -> None:
+    """Print the half-widths of prediction intervals, from the smallest to the largest."""
+    console = _console()
+    for text in found.warnings:
+        console.print(_text(text))
+    along = "" if found.schedule is None else f" along {found.schedule}"
+    promised = f"a new run is expected inside {100 * found.level:g} % of the time"
+    console.print(_text(f"half-widths of prediction intervals{along}; {promised}"))
+    table = _table("channel", "smallest", "largest", "unit")
+    for name, unit, half in zip(found.channels, found.units, found.half_width.T, strict=True):
+        table.add_row(_text(name), f"{half.min():.4g}", f"{half.max():.4g}", _text(unit))
+    console.print(table)
 
 
 def print_ranking(found: Ranking) -> None:
@@ -188,6 +209,15 @@ def print_article(article: Article) -> None:
 
 def _text(text: str) -> Text:
     return Text(printable(text))
+
+
+def _inside(validation: Validation, channel: str) -> list[str]:
+    """Share of the time inside the prediction intervals, mean over runs, and the level."""
+    if validation.intervals is None:
+        return ["", ""]
+    shares = validation.coverage(channel)
+    mean = "–" if shares is None else f"{100 * sum(shares) / len(shares):.1f} %"
+    return [mean, f"{100 * validation.intervals.level:g} %"]
 
 
 def _figure(value: float | None, form: str) -> str:

@@ -6,12 +6,15 @@ import json
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dfsm.errors import DfsmWarning, printable
 from dfsm.progress import show_progress
+
+if TYPE_CHECKING:
+    from dfsm.model import DFSM
 
 Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
@@ -25,6 +28,11 @@ def working(quiet: bool) -> Iterator[None]:
         if quiet:
             warnings.simplefilter("ignore", DfsmWarning)
         yield
+
+
+def fit_start(model: DFSM) -> float | None:
+    """Start of the fit's time window in s: where a simulation starts unless told otherwise."""
+    return model.provenance.record.get("settings", {}).get("start")
 
 
 def lines(text: str) -> str:

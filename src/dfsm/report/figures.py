@@ -19,6 +19,7 @@ from dfsm.types import Array
 from dfsm.validate import (
     LOW,
     ChannelStatistics,
+    ModelRun,
     RunComparison,
     Validation,
     frequency_bands,
@@ -118,12 +119,13 @@ def _model(name: str, validation: Validation, blobs: Blobs) -> dict[str, Any]:
 
 def _run(validation: Validation, run: RunComparison, blobs: Blobs) -> dict[str, Any]:
     names = [c.name for c in validation.channels]
-    simulations = [m.simulation for m in run.models.values()]
+    drawn = [m.simulation.trajectory for m in run.models.values() if _completed(m)]
+    drawn += [end for m in run.models.values() for end in m.band or ()]
     return {
         "name": run.recorded.name,
         "start": float(run.recorded.time[0]),
         "stop": float(run.recorded.time[-1]),
-        "ranges": [_range(name, run, simulations) for name in names],
+        "ranges": [_range(name, run, drawn) for name in names],
         "bands": [
             {"name": b.name, "low": b.low, "high": b.high} for b in bands_of(validation, run)
         ],
@@ -132,6 +134,7 @@ def _run(validation: Validation, run: RunComparison, blobs: Blobs) -> dict[str, 
             name: _series(m.simulation.trajectory, names, blobs)
             | _spectra(m.statistics, names, blobs)
             | _ending(m.simulation, names)
+            | _band(m, names, blobs)
             for name, m in run.models.items()
         },
     }
@@ -165,6 +168,15 @@ def _shown(spectrum: Spectrum) -> Spectrum:
     )
 
 
+def _band(model: ModelRun, names: Sequence[str], blobs: Blobs) -> dict[str, Any]:
+    """Ends of the prediction intervals, lower first; without them nothing."""
+    return {"band": [_series(end, names, blobs) for end in model.band]} if model.band else {}
+
+
+def _completed(model: ModelRun) -> bool:
+    return model.simulation.status is Status.COMPLETED
+
+
 def _ending(simulation: Simulation, names: Sequence[str]) -> dict[str, Any]:
     if simulation.status is Status.COMPLETED:
         return {"ended": None}
@@ -176,16 +188,16 @@ def _ending(simulation: Simulation, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _range(name: str, run: RunComparison, simulations: Sequence[Simulation]) -> list[float]:
-    """Y-range of a panel: the recorded signal and what completed rollouts add within reason."""
+def _range(name: str, run: RunComparison, drawn: Sequence[Trajectory]) -> list[float]:
+    """Y-range of a panel: the recorded signal and what is drawn beside it, within reason."""
     recorded = run.recorded[name]
     low, high = float(recorded.min()), float(recorded.max())
     span = (high - low) or max(abs(high), 1.0)
     reach = 0.6 * span
     least, most = low, high
-    for s in simulations:
-        values = s.trajectory[name]
-        if s.status is Status.COMPLETED and np.isfinite(values).all():
+    for trajectory in drawn:
+        values = trajectory[name]
+        if np.isfinite(values).all():
             least = min(least, max(float(values.min()), low - reach))
             most = max(most, min(float(values.max()), high + reach))
     return [least - 0.12 * span, most + 0.12 * span]

@@ -74,7 +74,12 @@ def _main(validations: Mapping[str, Validation]) -> Markup:
         _section("summary", "Summary", join(*heads), sections.glance(validations)),
         _controls(),
         _section("accuracy", "Accuracy", _per_model(validations, sections.accuracy)),
-        _section("series", "Time series", _figure("series-plot", "Time series", endings=True)),
+        _section(
+            "series",
+            "Time series",
+            _per_model(validations, sections.shading) if _shaded(validations) else "",
+            _figure("series-plot", "Time series", endings=True),
+        ),
         _section(
             "spectra",
             "Power spectral densities",
@@ -106,6 +111,10 @@ def _main(validations: Mapping[str, Validation]) -> Markup:
         _section("record", "Settings and data", _per_model(validations, sections.provenance)),
     ]
     return element("main", *parts)
+
+
+def _shaded(validations: Mapping[str, Validation]) -> bool:
+    return any(v.intervals is not None for v in validations.values())
 
 
 def _section(key: str, heading: str, *children: object) -> Markup:

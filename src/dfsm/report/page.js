@@ -174,8 +174,15 @@
 
   // -- figures ----------------------------------------------------------------------------------
 
+  // Curves' colours have six hexadecimal digits; two more give the opacity.
+  const tint = (colour) => colour + "30";
+
   function drawSeries() {
     const r = run();
+    const banded = model().variants.findIndex((name) => r.variants[name].band);
+    for (const patch of document.querySelectorAll(".patch.interval")) {
+      patch.style.background = banded < 0 ? "none" : tint(curve(banded));
+    }
     const list = model().channels.map((channel, c) => {
       const range = r.ranges[c];
       const at = (s, name, colour, width) => ({
@@ -185,7 +192,9 @@
         dx: s.dt,
         hovertemplate: "%{y:.5~g}",
       });
-      const traces = [at(r.recorded, "recorded", css("--recorded"), 1.6)];
+      const traces = [];
+      for (const [name, i] of shown()) traces.push(...shade(r.variants[name].band, c, curve(i)));
+      traces.push(at(r.recorded, "recorded", css("--recorded"), 1.6));
       for (const [name, i] of shown()) {
         const s = r.variants[name];
         traces.push(at(s, name, curve(i), width(i)));
@@ -204,6 +213,21 @@
         return item;
       });
     byId("endings").replaceChildren(...notes);
+  }
+
+  // Between the ends of prediction intervals; drawn first, so it lies below all curves.
+  function shade(band, c, colour) {
+    return (band || []).map((end, k) => ({
+      type: "scatter",
+      mode: "lines",
+      y: array(end.y[c]),
+      x0: end.t0,
+      dx: end.dt,
+      line: { width: 0 },
+      fill: k ? "tonexty" : "none",
+      fillcolor: tint(colour),
+      hoverinfo: "skip",
+    }));
   }
 
   // The last point of a rollout may lie far outside the panel; its mark stays inside.

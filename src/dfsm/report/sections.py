@@ -205,7 +205,8 @@ def accuracy(name: str, validation: Validation) -> Markup:
         ["Channel", "Unit", "Role", *["NRMSE", "RMSE", "max"] * len(v.models)],
         rows,
     )
-    return join(grid, *[_reason(v, m, letter) for m, letter in letters.items()])
+    reasons = [_reason(v, m, letter) for m, letter in letters.items()]
+    return join(grid, *reasons, _coverage(name, v))
 
 
 def _reason(v: Validation, model: str, letter: str) -> Markup:
@@ -213,6 +214,42 @@ def _reason(v: Validation, model: str, letter: str) -> Markup:
     return element(
         "p", element("sup", letter), text + "; ".join(endings(v, model)) + ".", cls="note"
     )
+
+
+def _coverage(name: str, v: Validation) -> Markup:
+    """How often the record lies inside the prediction intervals, beside the level promised."""
+    if v.intervals is None:
+        return Markup("")
+    rows = []
+    for c, half in zip(v.channels, v.intervals.half_width.T, strict=True):
+        shares = v.coverage(c.name)
+        figures = [None] * 3 if shares is None else [np.mean(shares), min(shares), max(shares)]
+        row = [c.name, c.unit or MISSING, float(half.min()), float(half.max())]
+        promised = Markup(f"{100 * v.intervals.level:g} %")
+        rows.append([*row, promised, *map(_share, figures)])
+    return table(
+        f"{name}: share of the time that the record lies inside the prediction intervals of "
+        f"the multi-fidelity model, over {plural(len(v.runs), 'test run')}",
+        [("", 2), ("half-width", 2), ("inside", 4)],
+        ["Channel", "Unit", "smallest", "largest", "promised", "mean", "lowest run", "highest run"],
+        rows,
+    )
+
+
+def _share(value: float | None) -> Markup:
+    return Markup(MISSING if value is None else f"{100 * value:.1f} %")
+
+
+def shading(_name: str, validation: Validation) -> Markup:
+    """What the band in the time series stands for; the page's script colours the patch."""
+    found = validation.intervals
+    if found is None:
+        return Markup("")
+    text = (
+        "Around the multi-fidelity rollout: where the record of a new run is expected "
+        f"{100 * found.level:g} % of the time, calibrated on {plural(len(found.runs), 'run')}."
+    )
+    return element("p", element("span", cls="patch interval"), text, cls="note")
 
 
 # -- derivatives, decisions, eigenvalues, times -------------------------------------------------
