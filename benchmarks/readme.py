@@ -164,6 +164,14 @@ def loads_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def leak_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors of a linear fit with each of three winds as its disturbance."""
+    lines = ["| wind given to the model | pitch | pitch rate | rotor speed |", "|---|---|---|---|"]
+    for wind, found in figures["leak"].items():
+        lines.append(f"| {wind} | {' | '.join(_two(v) for v in found.values())} |")
+    return lines
+
+
 def sweep_table(figures: Mapping[str, Any]) -> list[str]:
     """The sweep of constant winds in one line per figure."""
     found = figures["sweep"]
@@ -319,7 +327,12 @@ TABLES = {
     "parameters": parameters_table,
     "scaling": scaling_table,
 }
-ROLLOUT_TABLES = {"rollouts": rollouts_table, "loads": loads_table, "sweep": sweep_table}
+ROLLOUT_TABLES = {
+    "rollouts": rollouts_table,
+    "loads": loads_table,
+    "sweep": sweep_table,
+    "leak": leak_table,
+}
 CODESIGN_TABLES = {"codesign": codesign_table, "adaptive": adaptive_table}
 # By the part of the figures that each shows.
 CONTROL_TABLES = {
