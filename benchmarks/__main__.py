@@ -1,7 +1,9 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [control]
-    [codesign]
+    [codesign] [peer]
+
+Without names all but `peer`, which makes an environment of its own and installs jax-sysid there.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from benchmarks import (
     control,
     derivatives,
     parameters,
+    peer,
     rollouts,
     scaling,
     speed,
@@ -34,14 +37,15 @@ PARTS = {
     "rollouts": rollouts.run,
     "control": control.run,
     "codesign": codesign.run,
+    "peer": peer.run,
 }
 
 
 def main() -> None:
-    """Run the parts named on the command line, or all."""
+    """Run the parts named on the command line, or all but the peer."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}")
-    names = parser.parse_args().parts or list(PARTS)
+    names = parser.parse_args().parts or [n for n in PARTS if n != "peer"]
     unknown = [n for n in names if n not in PARTS]
     if unknown:
         parser.error(f"no part '{unknown[0]}'; choose from {', '.join(PARTS)}")

@@ -362,6 +362,8 @@ def main() -> None:
     if "rollouts" in figures:
         for name, table in ROLLOUT_TABLES.items():
             tables[name] = table(figures["rollouts"])
+    if "peer" in figures:
+        tables["peer"] = rollouts_table(figures["peer"])
     if "codesign" in figures:
         for name, table in CODESIGN_TABLES.items():
             tables[name] = table(figures["codesign"])

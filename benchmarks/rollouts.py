@@ -136,25 +136,33 @@ def leak(turbine: Any) -> dict[str, Any]:
 
 
 def errors(models: Sequence[dfsm.DFSM], runs: Sequence[dfsm.Trajectory]) -> dict[str, Any]:
-    """NRMSE per state below the cutoff and of all frequencies, mean over completed rollouts.
-
-    With several models, each run has that of its wind speed.
-    """
-    low, whole, ended = [], [], 0
+    """What `judged` says of rollouts; with several models, each run has that of its wind speed."""
+    found = []
     for run in runs:
         model = models[WINDS.index(run.name.split("_")[2]) % len(models)]
         rollout = dfsm.simulate(model, run, start=demo().START)
-        if rollout.status is not dfsm.Status.COMPLETED:
-            ended += 1
+        completed = rollout.status is dfsm.Status.COMPLETED
+        found.append(rollout.trajectory.select(STATES).values if completed else None)
+    return judged(runs, found)
+
+
+def judged(runs: Sequence[dfsm.Trajectory], found: Sequence[Array | None]) -> dict[str, Any]:
+    """NRMSE per state below the cutoff and of all frequencies, mean over completed rollouts.
+
+    `found` has the states (time, state) of every run from the start on, None where its rollout
+    ended early; a column of NaN is a state that was not predicted.
+    """
+    low, whole = [], []
+    for run, values in zip(runs, found, strict=True):
+        if values is None:
             continue
         truth = _recorded(run)
-        found = rollout.trajectory.select(STATES).values
-        low.append(_nrmse(_low_passed(run, found), _low_passed(run, truth)))
-        whole.append(_nrmse(found, truth))
+        low.append(_nrmse(_low_passed(run, values), _low_passed(run, truth)))
+        whole.append(_nrmse(values, truth))
     none = [float("nan")] * len(STATES)
     mean = [np.mean(part, axis=0).tolist() if part else none for part in (low, whole)]
     return {
-        "diverged": ended,
+        "diverged": len(runs) - len(low),
         "of": len(runs),
         "filtered": dict(zip(STATES, mean[0], strict=True)),
         "unfiltered": dict(zip(STATES, mean[1], strict=True)),
