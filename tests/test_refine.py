@@ -21,6 +21,8 @@ from dfsm.fit import fit
 from dfsm.linear import LTI
 from dfsm.parametrise import Parametrisation
 from dfsm.refine import RefineSettings, refine
+from dfsm.refine_stability import StabilityKept
+from dfsm.refine_start import start_network
 from dfsm.rollout_error import RolloutError, record_of
 from dfsm.samples import FitSettings
 from dfsm.simulate import simulate
@@ -133,6 +135,55 @@ def test_slopes_agree_with_differences(runs, biased):
         d = eps * np.eye(parameters.size)[k]
         slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("network", [0, 3])
+def test_growth_adds_to_the_cost_with_exact_slopes(runs, biased, network):
+    """Slopes against differences where an eigenvalue is past the margin, and the wall."""
+    # Growth of -0.003 1/s is between the margin and the wall.
+    L = biased.f.coefficients.at[0, 1, 2].set(-0.006)
+    model = replace(biased, f=replace(biased.f, coefficients=L))
+    if network:
+        model = start_network(model, network, np.array([1.0, 3.0]), 0)
+    parameters = Parametrisation.of(model, np.array([1.0, 3.0]))
+    kept = StabilityKept(parameters, 1000)
+    rng, eps = np.random.default_rng(0), 1e-6
+    draws = (1e-4 * rng.normal(size=parameters.size) for _ in range(200))
+    at = next(w for w in draws if 0 < kept.cost(w) < np.inf)
+    slopes = [
+        (kept.cost(at + d) - kept.cost(at - d)) / (2 * eps) for d in eps * np.eye(parameters.size)
+    ]
+    np.testing.assert_allclose(2 * kept.normal_equations(at)[1], slopes, rtol=1e-4, atol=1e-4)
+    draws = (0.5 * rng.normal(size=parameters.size) for _ in range(200))
+    assert any(kept.cost(w) == np.inf for w in draws)
+
+
+def test_growth_of_a_start_that_is_unstable_is_left_alone(biased):
+    L = biased.f.coefficients.at[0, 1, 2].set(0.2)
+    unstable = replace(biased, f=replace(biased.f, coefficients=L))
+    kept = StabilityKept(Parametrisation.of(unstable, np.array([1.0, 3.0])), 1000)
+    zero = np.zeros(4)
+    assert kept.cost(zero) == 0
+    assert not kept.normal_equations(zero)[0].any()
+
+
+def test_a_network_is_added_that_changes_nothing_yet(runs, biased):
+    added = start_network(biased, 5, np.array([1.0, 3.0]), 0)
+    before, after = (simulate(m, runs[0]).trajectory.values for m in (biased, added))
+    np.testing.assert_allclose(before, after)
+    refined = refine(biased, runs, replace(CHOICES, network=5, iterations=4)).model
+    assert isinstance(refined.e, Perceptron)
+    assert np.asarray(refined.e.weights[-1]).any()
+    assert refined.corrected == (1,)
+
+
+def test_decay_keeps_a_model_near_its_start(runs, biased):
+    far, near = (
+        refine(biased, runs, replace(CHOICES, decay=d, iterations=4)).model.f.coefficients
+        for d in (0.0, 1e6)
+    )
+    start = biased.f.coefficients
+    assert np.abs(near - start).max() < 0.3 * np.abs(far - start).max()
 
 
 @pytest.mark.parametrize("kind", ["units", "perceptron", "none"])

@@ -18,6 +18,8 @@ from dfsm.model import DFSM
 from dfsm.samples import FitSettings, Samples
 from dfsm.types import Array
 
+# Stability is looked at in so many places from one operating point to the next.
+_BETWEEN = 4
 # A correction is kept if it explains at least this share of the residual's variance on runs left
 # out of training. Less than that is within what cross-validation finds in noise, and may undo what
 # a stable linear fit has gained.
@@ -140,7 +142,7 @@ def _target_names(samples: Samples, derivatives: bool) -> Sequence[tuple[str, st
 
 
 def destabilised(model: DFSM) -> str | None:
-    """Tell whether the corrective function of the derivatives makes an operating point unstable.
+    """Tell whether the corrective function makes an operating point, or one between two, unstable.
 
     Parameters
     ----------
@@ -155,7 +157,7 @@ def destabilised(model: DFSM) -> str | None:
     if model.e is None:
         return None
     worst, where = -np.inf, 0.0
-    for value, point in zip(model.region.grid, model.region.operating, strict=True):
+    for value, point in zip(*operating_points(model), strict=True):
         A = model.jacobians(*model.split(point))[0]
         growth = float(np.linalg.eigvals(A).real.max())
         if growth > worst:
@@ -164,3 +166,12 @@ def destabilised(model: DFSM) -> str | None:
         return None
     place = f" at {model.schedule} = {where:.4g}" if model.schedule else ""
     return f"with a correction the model would be unstable{place} (growth {worst:.2g} 1/s)"
+
+
+def operating_points(model: DFSM) -> tuple[Array, Array]:
+    """Schedule values ``(point,)`` and inputs ``(point, input)`` where stability is looked at."""
+    grid, operating = np.asarray(model.region.grid), np.asarray(model.region.operating)
+    places = np.arange((len(grid) - 1) * _BETWEEN + 1) / _BETWEEN
+    table = np.column_stack([grid, operating]).T
+    found = np.stack([np.interp(places, np.arange(len(grid)), row) for row in table], axis=1)
+    return found[:, 0], found[:, 1:]

@@ -23,18 +23,17 @@ from itertools import islice
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.correction import destabilised
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
 from dfsm.errors import DfsmError, DfsmWarning, near_matches
 from dfsm.latents import as_states, poles, with_latent_range
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.progress import track
+from dfsm.refine_stability import StabilityKept
 from dfsm.refine_start import start_latents, start_network
 from dfsm.rollout_error import RolloutError, record_of
 from dfsm.settings import require, settings
 from dfsm.signals import Provenance
-from dfsm.stability import fastest_growth
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.types import Array
 
@@ -195,10 +194,11 @@ def refine(
         parameters = Parametrisation.of(started, spread)
         final = RolloutError(parameters, held, choices.windows[-1], weights)
         at = np.zeros(parameters.size)
-    best, steady = at, _stability_kept(parameters)
+    best, samples = at, sum(r.states[1:].size for r in train)
+    kept = StabilityKept(parameters, samples)
     history: list[dict[str, float]] = []
     for stage, length in enumerate(choices.windows):
-        problem = RolloutError(parameters, train, length, weights, choices.decay, steady)
+        problem = RolloutError(parameters, train, length, weights, choices.decay, kept)
         check = RolloutError(parameters, held, length, weights)
         at, found = _stage(problem, check, at, choices.iterations, late)
         history += [{"stage": stage, **entry} for entry in found]
@@ -235,22 +235,6 @@ def _weights(model: DFSM, choices: RefineSettings) -> Array:
             f"{', '.join(names)}"
         )
     return np.array([choices.weights.get(n, 1.0) for n in names])
-
-
-def _stability_kept(parameters: Parametrisation) -> Callable[[Array], bool]:
-    """Whether a model is stable; always true if the start is not.
-
-    A linear one at all schedule values, one with a corrective function at all operating points.
-    """
-    columns = parameters.model.signals.state_columns
-
-    def stable(at: Array) -> bool:
-        model = parameters.at(jnp.asarray(at))
-        if model.e is not None:
-            return destabilised(model) is None
-        return fastest_growth(model.f, columns) <= 0
-
-    return stable if stable(np.zeros(parameters.size)) else lambda _: True
 
 
 # -- stages -------------------------------------------------------------------------------------

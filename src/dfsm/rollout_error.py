@@ -28,6 +28,7 @@ from dfsm.integrate import clip_range, exogenous_groups, rate, rk4
 from dfsm.latents import Poles, as_states, evolve, poles, rest
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
+from dfsm.refine_stability import StabilityKept
 from dfsm.signals import with_computed
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array, IntArray
@@ -171,8 +172,8 @@ class RolloutError:
         Of the observed states' squared errors.
     decay
         Weight of the squared deviations, added to |r|².
-    allowed
-        Whether deviations are allowed; the cost of all others is infinite.
+    kept
+        What else adds to |r|².
     """
 
     def __init__(
@@ -182,9 +183,9 @@ class RolloutError:
         length: float | None,
         weights: Array,
         decay: float = 0.0,
-        allowed: Callable[[Array], bool] | None = None,
+        kept: StabilityKept | None = None,
     ) -> None:
-        self._decay, self._allowed = decay, allowed
+        self._decay, self._kept = decay, kept
         self._batches = [_windows(r, length) for r in records]
         overall = np.concatenate([r.states for r in records]).std(axis=0)
         self._scales = [
@@ -206,11 +207,11 @@ class RolloutError:
             return list(pool.map(one, range(len(self._batches))))
 
     def cost(self, weights: Array) -> float:
-        """|r|² and decay, infinite where a rollout is not finite or the weights are not allowed."""
-        total = self.relative(weights) * self._count + self._decay * float(weights @ weights)
-        if np.isfinite(total) and self._allowed is not None and not self._allowed(weights):
+        """|r|² and what is added to it, infinite where a rollout is not finite."""
+        extra = 0.0 if self._kept is None else self._kept.cost(weights)
+        if not np.isfinite(extra):
             return np.inf
-        return total
+        return self.relative(weights) * self._count + self._decay * float(weights @ weights) + extra
 
     def relative(self, weights: Array) -> float:
         """Mean square of r: 1 is as wrong as a constant; infinite where one is not finite."""
@@ -218,9 +219,13 @@ class RolloutError:
         return total / self._count if np.isfinite(total) else np.inf
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
-        """JᵀJ and Jᵀr, the decay included."""
+        """JᵀJ and Jᵀr of all of it."""
         parts = self._over_runs(_sums, weights)
         JtJ, Jtr = (np.sum([np.asarray(p[k]) for p in parts], axis=0) for k in (0, 1))
+        if self._kept is not None:
+            JtJ, Jtr = (
+                a + b for a, b in zip((JtJ, Jtr), self._kept.normal_equations(weights), strict=True)
+            )
         return JtJ + self._decay * np.eye(len(Jtr)), Jtr + self._decay * weights
 
 

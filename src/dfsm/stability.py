@@ -155,7 +155,7 @@ def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: f
     for _ in range(_STEPS):
         current = A.copy()
         current[rows] += total
-        eigenvalues, left, right = _eigen(current)
+        eigenvalues, left, right = eigen(current)
         # One of each conjugate pair; aiming a little further makes the last step land inside.
         active = (eigenvalues.real > -margin) & (eigenvalues.imag >= 0)
         if not active.any():
@@ -178,7 +178,7 @@ def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: f
     )
 
 
-def _eigen(A: Array) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+def eigen(A: Array) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Eigenvalues, left and right eigenvectors as rows, scaled so that wᴴ v = 1."""
     found: Any = eig(A, left=True, right=True)
     eigenvalues, left, right = found[0], found[1].T, found[2].T
