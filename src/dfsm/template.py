@@ -65,7 +65,7 @@ azimuth: {azimuth}
 nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in the report
 # Refine the derivative fit on rollouts over the training runs (null is a whole run), with latent
 # states that remember the inputs, for instance
-# refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8}}
+# refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8, network: 16, decay: 3}}
 refine: null
 seed: 0
 
