@@ -129,6 +129,17 @@ def as_states(pairs: jax.Array) -> jax.Array:
 _evolve = jax.jit(evolve)
 
 
+def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
+    """Input vectors ``(..., input)`` with the latent states that their own inputs lead to."""
+    s = model.signals
+    if not s.latents:
+        return inputs
+    found, first = poles(model), s.observed_columns.stop
+    force = inputs[..., : len(s.driving)] @ found.drive.T + found.offset
+    pairs = as_states(force / (found.decay + 1j * found.frequency))
+    return inputs.at[..., first : first + len(s.latents)].set(pairs)
+
+
 def latent_path(model: DFSM, run: Trajectory) -> Array:
     """Latent states along the recorded inputs of a run.
 
@@ -227,8 +238,8 @@ def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Arra
 def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
     """The model with the training range of its latent states taken from their paths."""
     s = model.signals
-    at = s.observed_columns.stop
-    return replace(model, region=_with_range(model.region, at, len(s.latents), paths))
+    region = _with_range(model.region, s.observed_columns.stop, len(s.latents), paths)
+    return replace(model, region=replace(region, operating=at_rest(model, region.operating)))
 
 
 def _ignoring(corrective: Corrective, at: int, count: int) -> Corrective:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.correction import operating_points
+from dfsm.latents import at_rest
 from dfsm.parametrise import Parametrisation
 from dfsm.stability import eigen, fastest_growth
 from dfsm.types import Array, ComplexArray
@@ -90,7 +91,7 @@ def _state_matrices(
     model = parameters.at(weights)
 
     def at_point(inputs: jax.Array) -> jax.Array:
-        x, *others = model.split(inputs)
+        x, *others = model.split(at_rest(model, inputs))
         return jax.jacfwd(lambda x: model.derivative(x, *others))(x)
 
     return jax.vmap(at_point)(points)
@@ -110,7 +111,7 @@ def _slopes(
         weights: jax.Array, inputs: jax.Array, left: jax.Array, right: jax.Array
     ) -> jax.Array:
         model = parameters.at(weights)
-        x, *others = model.split(inputs)
+        x, *others = model.split(at_rest(model, inputs))
         turn = lambda v: jax.jvp(lambda x: model.derivative(x, *others), (x,), (v,))[1]  # noqa: E731
         return jnp.real(jnp.conj(left) @ (turn(right.real) + 1j * turn(right.imag)))
 
