@@ -34,7 +34,7 @@ BRAKING = {"GenSpeed": {"GenTq": -2.997e-5}}
 REFINEMENT = dfsm.RefineSettings(
     windows=(20.0, None),
     step=0.5,
-    iterations=18,
+    iterations=14,
     latents=8,
     latent_inputs=(
         *("BldPitch1", "RotWind", "RotShearV", "RotShearH"),
@@ -88,7 +88,7 @@ def refined_settings() -> dfsm.FitSettings:
             dfsm.StateSpec(name="GenSpeed"),
         ),
         features=(dfsm.Feature(source="Wave1Elev"),),
-        linear=dfsm.LPV(schedule="RotWind", points=5, known=BRAKING, margin=MARGIN),
+        linear=dfsm.LPV(schedule="RotWind", points=9, known=BRAKING, margin=MARGIN),
         nonlinear_only=False,
     )
 
