@@ -104,13 +104,18 @@ def test_power_is_in_megawatts_and_below_what_the_wind_holds(found: ControlStudy
         assert np.mean(r.power_course) == pytest.approx(r.power, rel=0.01)
 
 
-def test_staying_inside_costs_little_and_keeps_the_controls_inside(found: ControlStudy):
+def test_staying_inside_keeps_near_the_data_at_a_cost(region: Region, found: ControlStudy):
     results = {(r.variant, r.most_pitch): r for r in found.results}
     free, inside = results["b", 5.0], results["b, inside", 5.0]
     assert free.outside[TORQUE] > 0.5
     assert not {TORQUE, BLADE, PITCH, SPEED} & set(inside.outside)
     assert free.solution.objective < inside.solution.objective
-    assert inside.solution.objective == pytest.approx(free.solution.objective, rel=0.02)
+    assert inside.solution.objective == pytest.approx(free.solution.objective, rel=0.1)
+    names = [c.name for c in region.model.signals.inputs]
+    distance = region.model.region.distance
+    for r, near in ((free, False), (inside, True)):
+        far = np.asarray(distance(r.run.select(names).values, chosen=True)).max()
+        assert (far < 1 + 1e-4) == near
 
 
 def test_bounds_that_cannot_be_met_are_named(region: Region):

@@ -34,6 +34,8 @@ RADIUS, DENSITY, BEST_COEFFICIENT = 120.0, 1.225, 0.489
 MEGAWATT = np.pi / 30e3  # of kN m × rpm
 _TORQUE_WEIGHT, _BLADE_WEIGHT = 1e-5, 0.5
 _PERCENTILE = 99.9  # of the loads in the training runs, in case (b)
+# Share of the horizon outside the training data above which case (b) is solved inside, too.
+_LEAVES = 0.01
 # What counts as "at the peak" of the platform pitch: this share of the horizon.
 _PEAK = 0.05
 
@@ -103,7 +105,8 @@ class ControlStudySize:
     tolerance
         Of the nonlinear program.
     inside
-        Solve case (b) also with states and controls kept inside the training range.
+        Where solutions of case (b) leave the training data, solve it also with states and controls
+        kept inside.
     """
 
     points: int = 1000
@@ -352,7 +355,7 @@ def optimise(
     size
         Nodes, horizon and tolerance.
     inside
-        Keep states and controls inside the training range.
+        Keep states and controls inside the training data.
     """
     method = DirectTranscription(
         scheme="trapezoidal",
@@ -388,11 +391,13 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
     begin, results = clock.perf_counter(), []
     for region in regions:
         own = turbine_case(region)
-        variants = [(PAPER, False), (own, False), *([(own, True)] if size.inside else [])]
         for wind in region.tests:
-            for case, inside in variants:
-                for most_pitch in size.pitch_limits:
-                    results.append(optimise(region, wind, case, most_pitch, size, inside))
+            for case in (PAPER, own):
+                found = [optimise(region, wind, case, p, size) for p in size.pitch_limits]
+                results += found
+            left = any((r.solution.outside or 0.0) > _LEAVES for r in found)
+            if size.inside and left:
+                results += [optimise(region, wind, own, p, size, True) for p in size.pitch_limits]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
