@@ -13,6 +13,8 @@ from dfsm.types import Array
 _TIME = "time (s)"
 # Bounds further away than this share of a signal's range would flatten it: they are not drawn.
 _FAR = 1.5
+# What varies less than this share of its size is drawn as still, with this share around it.
+_STILL, _MARGIN = 1e-3, 0.05
 
 
 def stacked_figure(
@@ -85,7 +87,16 @@ def _panel(
             # In the colour of its solution it needs no entry of its own in the legend.
             title = "bounds" if shared else label
             curves.append(Curve(title, times[label], limit, paint, "dashed"))
-    return Panel(f"{name} ({unit})" if unit else name, _TIME, "", tuple(curves))
+    title = f"{name} ({unit})" if unit else name
+    return Panel(title, _TIME, "", tuple(curves), y_range=_around(least, most))
+
+
+def _around(least: float, most: float) -> tuple[float, float] | None:
+    """A range for what hardly varies, lest its axis magnify the solver's tolerance; else None."""
+    size = max(abs(least), abs(most))
+    if size == 0 or most - least > _STILL * size:
+        return None
+    return least - _MARGIN * size, most + _MARGIN * size
 
 
 def _all_same(values: Sequence[Array]) -> bool:
