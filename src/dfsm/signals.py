@@ -9,7 +9,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from numpy.typing import ArrayLike
 
 import dfsm.jax_setup  # noqa: F401
@@ -261,17 +260,21 @@ class Region(eqx.Module):
             return jnp.zeros(inputs.shape[:-1])
         W = self.whitening[:, self.fixed :] if chosen else self.whitening
         total = jnp.zeros(inputs.shape[:-1])
-        for k, share in enumerate(self._shares(inputs)):
-            apart = (inputs - self.operating[k]) @ W[k].T
-            total += share * jnp.sum(apart**2, axis=-1)
+        shares = self._shares(inputs)
+        for k, (middle, rows) in enumerate(zip(self.operating, W, strict=True)):
+            apart = (inputs - middle) @ rows.T
+            total += shares[..., k] * jnp.sum(apart**2, axis=-1)
         return total
 
-    def _shares(self, inputs: jax.Array) -> list[jax.Array]:
-        """Hat functions of the schedule, ``(...)`` for every operating point."""
+    def _shares(self, inputs: jax.Array) -> jax.Array:
+        """Hat functions of the schedule, ``(..., point)``."""
+        one = jnp.ones((*inputs.shape[:-1], 1))
         if self.schedule is None:
-            return [jnp.ones(inputs.shape[:-1])]
-        rows = np.eye(len(self.grid))
-        return [jnp.interp(inputs[..., self.schedule], self.grid, row) for row in rows]
+            return one
+        value = inputs[..., self.schedule, None]
+        after = jnp.clip((value - self.grid[:-1]) / jnp.diff(self.grid), 0.0, 1.0)
+        before = jnp.concatenate([one, after], axis=-1)
+        return before - jnp.concatenate([after, 0 * one], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
