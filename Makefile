@@ -11,7 +11,7 @@ demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/optimal_control.py --models out --output out --quick
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -31,6 +31,13 @@ CONFIG: dict[str, Any] = {
     "corrective": {"kind": "rbf", "samples": 25},
 }
 
+# Files that take minutes; workers take them first, so that none is left alone with one at the end.
+LONG = ("test_results", "test_parameters", "test_studies", "test_adaptive", "test_latents")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
 
 @dataclass(frozen=True)
 class Result:
