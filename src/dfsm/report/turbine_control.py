@@ -167,8 +167,9 @@ def _series_section(name: str, found: Sequence[Result]) -> Section:
         _HEADS,
         tuple(_cells(r) for r in found),
         note=(
-            "Power: mean of η τ ω. dβ/dt: RMS. Outside: share of the horizon with any input "
-            "outside the training range. Steps: of the solver; time: with compilation. Replay: "
+            "Power: mean of η τ ω. dβ/dt: RMS. Outside: share of the horizon with an input beyond "
+            "its training range, or a combination that did not occur there. Steps: of the solver; "
+            "time: with compilation. Replay: "
             "how far Θp is off at most when an adaptive integrator applies the controls with all "
             "samples of the wind. "
             f"Recorded in closed loop: {cell_text(first.recorded_power / first.case.efficiency)} "
