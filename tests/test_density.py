@@ -11,11 +11,12 @@ import pytest
 
 from dfsm.control import DirectTranscription, OptimalControlProblem, solve
 from dfsm.corrective import NoCorrection
-from dfsm.density import hats, whiten
+from dfsm.density import whiten
 from dfsm.derivatives import StateSpec
 from dfsm.fit import fit
 from dfsm.linear import LPV, LTI
 from dfsm.samples import FitSettings
+from dfsm.schedule import hats
 from dfsm.simulate import simulate
 from dfsm.storage import load, save
 from dfsm.trajectory import Channel, Trajectory

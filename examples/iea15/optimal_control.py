@@ -15,24 +15,18 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import demo  # its neighbour
+
 import dfsm
 from dfsm.console import print_article
 from dfsm.report.publish import publish
 from dfsm.report.turbine_control import control_article
-from dfsm.studies.turbine_control import ControlStudy, ControlStudySize, Region, study
+from dfsm.studies.turbine_control import ControlStudy, Region, study
 
-DATA = Path(__file__).parent
-START = 100.0  # s, the start-up transient before it is dropped
 # Winds (m/s, as in the file names) and the seeds to optimise for: two in the transition region,
 # one below and one above it.
 SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
 QUICK = {"12": range(9, 10)}
-
-
-def runs(wind: str, seeds: range) -> list[dfsm.Trajectory]:
-    """Bundled closed-loop runs."""
-    stems = [f"iea15_2dof_{wind}mps_s{seed:02d}" for seed in seeds]
-    return list(dfsm.read_all([next(DATA.glob(f"{stem}.[op]*")) for stem in stems]))
 
 
 def regions(models: Path, series: Mapping[str, range]) -> list[Region]:
@@ -41,16 +35,13 @@ def regions(models: Path, series: Mapping[str, range]) -> list[Region]:
     for wind, seeds in series.items():
         own = dfsm.load(models / f"model_{int(wind)}mps")
         speed = float(wind)
-        training, tests = runs(wind, range(1, 9)), runs(wind, seeds)
+        training, tests = demo.runs([wind], range(1, 9)), demo.runs([wind], seeds)
         name = f"{speed:g} m/s"
-        found.append(Region(name, speed, own, everywhere, training, tests, START))
+        found.append(Region(name, speed, own, everywhere, training, tests, demo.START))
     return found
 
 
-def main(
-    arguments: Sequence[str] | None = None,
-    size: ControlStudySize | None = None,
-) -> ControlStudy:
+def main(arguments: Sequence[str] | None = None) -> ControlStudy:
     """Optimise, print the tables, write the page and the figures."""
     parser = argparse.ArgumentParser(description="Optimal control on bundled OpenFAST runs.")
     parser.add_argument("--models", type=Path, default=Path("out"), help="folder of demo.py")
@@ -62,7 +53,7 @@ def main(
         parser.error(f"{options.models} holds no models: run examples/iea15/demo.py first")
     with dfsm.show_progress(), warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)  # they stand in the tables
-        found = study(regions(options.models, series), size)
+        found = study(regions(options.models, series))
     article = control_article(found)
     written = publish(article, options.output)
     print_article(article)

@@ -18,7 +18,7 @@ from safetensors.numpy import load_file, save_file
 
 import dfsm
 from dfsm.errors import DfsmError
-from dfsm.files import json_bytes, json_value, write_folder
+from dfsm.files import check_format, json_bytes, json_value, write_folder
 from dfsm.types import Array
 
 MANIFEST = "manifest.json"
@@ -71,11 +71,7 @@ class Bundle:
         version = manifest.get("format") if isinstance(manifest, dict) else None
         if not isinstance(version, int):
             raise self.damaged(path, f"{MANIFEST} states no format number")
-        if version > self.format:
-            raise DfsmError(
-                f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to "
-                f"{self.format}: upgrade with pip install -U dfsm"
-            )
+        check_format(path, version, self.format)
         if manifest.get("checksum") != _checksum(manifest):
             raise self.damaged(path, f"{MANIFEST} is not as it was written")
         return manifest

@@ -18,7 +18,7 @@ import typer
 from dfsm.cli_control import check_run, export_rosco
 from dfsm.cli_intervals import calibrate
 from dfsm.cli_optimize import optimize
-from dfsm.errors import DfsmError, DfsmWarning, printable
+from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
 from dfsm.progress import show_progress
 from dfsm.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
 
@@ -252,8 +252,7 @@ def simulate(
     given = None if intervals is None else load_intervals(intervals)
     if given is not None:
         given.check(surrogate)
-    with working(quiet), warnings.catch_warnings():
-        warnings.simplefilter("ignore", DfsmWarning)  # the outcome is printed below
+    with working(quiet), hushed():  # the outcome is printed below
         signals = surrogate.signals
         recorded = with_computed(read(run), signals.hub_height, signals.features)
         result = run_simulate(

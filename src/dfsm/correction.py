@@ -13,6 +13,7 @@ import numpy as np
 
 from dfsm.corrective import Corrective, NoCorrection, fit_corrective
 from dfsm.derivatives import kinematic_rows
+from dfsm.latents import at_rest
 from dfsm.linear import LinearFit, LinearModel
 from dfsm.model import DFSM
 from dfsm.samples import FitSettings, Samples
@@ -156,16 +157,27 @@ def destabilised(model: DFSM) -> str | None:
     """
     if model.e is None:
         return None
-    worst, where = -np.inf, 0.0
-    for value, point in zip(*operating_points(model), strict=True):
-        A = model.jacobians(*model.split(point))[0]
-        growth = float(np.linalg.eigvals(A).real.max())
-        if growth > worst:
-            worst, where = growth, float(value)
-    if worst <= 0:
+    grid, points = operating_points(model)
+    growth = np.linalg.eigvals(state_matrices(model, points)).real.max(axis=1)
+    worst = int(np.argmax(growth))
+    if growth[worst] <= 0:
         return None
-    place = f" at {model.schedule} = {where:.4g}" if model.schedule else ""
-    return f"with a correction the model would be unstable{place} (growth {worst:.2g} 1/s)"
+    place = f" at {model.schedule} = {grid[worst]:.4g}" if model.schedule else ""
+    return f"with a correction the model would be unstable{place} (growth {growth[worst]:.2g} 1/s)"
+
+
+def state_matrices(model: DFSM, points: Array) -> Array:
+    """A at inputs ``(point, input)`` with latent states at rest, ``(point, state, state)``."""
+    return np.asarray(_state_matrices(model, jnp.asarray(points)))
+
+
+@eqx.filter_jit
+def _state_matrices(model: DFSM, points: jax.Array) -> jax.Array:
+    def at_point(inputs: jax.Array) -> jax.Array:
+        x, *others = model.split(at_rest(model, inputs))
+        return jax.jacfwd(lambda x: model.derivative(x, *others))(x)
+
+    return jax.vmap(at_point)(points)
 
 
 def operating_points(model: DFSM) -> tuple[Array, Array]:

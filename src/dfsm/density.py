@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from dfsm.schedule import hats
 from dfsm.types import Array, IntArray
 
 # The distance that this share of the samples keeps, each measured by the data of other runs.
@@ -51,7 +54,7 @@ def whiten(
     sums = np.array([[_sums(z[b[groups[b] == k]]) for b in bins] for k in np.unique(groups)])
     total = sums.sum(axis=0)
     means = total[:, 0, 1:] / total[:, :1, 0]
-    grid = means[:, schedule] if schedule is not None else np.zeros(1)
+    grid = means[:, schedule or 0]
     found = []
     for k in np.unique(groups):
         mine, others = groups == k, total - sums[k]
@@ -59,23 +62,22 @@ def whiten(
         enough = others[:, 0, 0] > 2 * z.shape[1]
         used = np.where(enough[:, None, None], others, total)
         W = np.stack([_whitening(s, order) for s in used])
-        s = z[mine, schedule] if schedule is not None else np.zeros(mine.sum())
-        found.append(distances(z[mine], hats(grid, s), used[:, 0, 1:] / used[:, :1, 0], W))
+        middles = used[:, 0, 1:] / used[:, :1, 0]
+        shares = hats(jnp.asarray(grid), jnp.asarray(z[mine, schedule or 0]))
+        given = map(jnp.asarray, (z[mine], shares, middles, W))
+        found.append(np.sqrt(squared_distance(*given)))
     reach = float(np.quantile(np.concatenate(found), _SHARE))
     return np.stack([_whitening(s, order) for s in total]) / std, reach
 
 
-def hats(grid: Array, schedule: Array) -> Array:
-    """Weights of the operating points, linear between them, shape ``(sample, point)``."""
-    if len(grid) == 1:
-        return np.ones((len(schedule), 1))
-    return np.stack([np.interp(schedule, grid, row) for row in np.eye(len(grid))], axis=1)
-
-
-def distances(inputs: Array, shares: Array, means: Array, W: Array) -> Array:
-    """Root of the weighted squared distances from the operating points, shape ``(sample,)``."""
-    squares = [np.sum(((inputs - m) @ w.T) ** 2, axis=1) for m, w in zip(means, W, strict=True)]
-    return np.sqrt(np.sum(shares * np.stack(squares, axis=1), axis=1))
+def squared_distance(
+    inputs: jax.Array, shares: jax.Array, middles: jax.Array, W: jax.Array
+) -> jax.Array:
+    """Σ_k h_k |W_k (I − μ_k)|² of inputs ``(..., input)`` and shares h ``(..., point)``."""
+    total = jnp.zeros(inputs.shape[:-1])
+    for k, (middle, rows) in enumerate(zip(middles, W, strict=True)):
+        total += shares[..., k] * jnp.sum(((inputs - middle) @ rows.T) ** 2, axis=-1)
+    return total
 
 
 def _groups(runs: IntArray) -> IntArray:

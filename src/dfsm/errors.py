@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 # Share of letters in common from which two names are alike.
 _ALIKE = 0.6
@@ -18,6 +20,14 @@ class DfsmError(Exception):
 
 class DfsmWarning(UserWarning):
     """Something a user should know about a result that was produced nevertheless."""
+
+
+@contextmanager
+def hushed() -> Iterator[None]:
+    """Without dfsm's warnings: whoever calls tells what became of the data and the rollouts."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        yield
 
 
 def printable(text: str) -> str:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import dfsm
 from dfsm.errors import DfsmError
 
 
@@ -89,6 +90,21 @@ def check_file(path: str | Path, sources: Iterable[str | Path | None] = ()) -> N
     _check_parent(path)
     if path.exists() and any(s is not None and path.samefile(s) for s in sources):
         raise DfsmError(f"{path} is one of the files to read: choose another name to write to")
+
+
+def check_format(path: Path, version: int, newest: int) -> None:
+    """Refuse what a newer dfsm wrote.
+
+    Raises
+    ------
+    DfsmError
+        Names both numbers and the remedy.
+    """
+    if version > newest:
+        raise DfsmError(
+            f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to {newest}: "
+            "upgrade with pip install -U dfsm"
+        )
 
 
 def check_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> None:

@@ -23,7 +23,7 @@ from dfsm.correction import correct, destabilised
 from dfsm.corrective import Corrective, NoCorrection, fit_corrective
 from dfsm.density import whiten
 from dfsm.derivatives import kinematic_rows
-from dfsm.errors import DfsmError, DfsmWarning, near_matches
+from dfsm.errors import DfsmError, DfsmWarning, hushed, near_matches
 from dfsm.linear import LPV, LinearFit, LinearModel, fit_linear, schedule_windows
 from dfsm.model import DFSM
 from dfsm.refine import RefineSettings, refine
@@ -347,8 +347,7 @@ def _check(
             "other set linear.margin, or expect rollouts to drift off"
         )
     some = [data[i] for i in np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int))]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DfsmWarning)
+    with hushed():
         rollouts = simulate(model, some, start=choices.start, stop=choices.stop)
     done = sum(r.status is Status.COMPLETED for r in rollouts)
     checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 import dfsm
 from dfsm.errors import DfsmError
-from dfsm.files import write_json
+from dfsm.files import check_format, write_json
 from dfsm.model import DFSM
 from dfsm.read.assemble import existing_file
 from dfsm.simulate import Simulation
@@ -187,11 +187,8 @@ def load_intervals(path: str | Path) -> Intervals:
     except (ValueError, RecursionError):
         raise _foreign(path, "not JSON") from None
     version = raw.get("format") if isinstance(raw, dict) else None
-    if isinstance(version, int) and version > _FORMAT:
-        raise DfsmError(
-            f"{path} has format {version}, this dfsm {dfsm.__version__} reads up to {_FORMAT}: "
-            "upgrade with pip install -U dfsm"
-        )
+    if isinstance(version, int):
+        check_format(path, version, _FORMAT)
     try:
         found = _File.model_validate(raw)
     except ValidationError as error:

@@ -22,6 +22,7 @@ import numpy as np
 import dfsm.jax_setup  # noqa: F401
 from dfsm.errors import DfsmError, near_matches
 from dfsm.least_squares import BLOCK, NormalEquations, Solution, merge, shared_coefficients
+from dfsm.schedule import hats
 from dfsm.settings import settings
 from dfsm.types import Array, IntArray
 
@@ -125,13 +126,7 @@ class LinearModel(eqx.Module):
 
     def shares(self, inputs: jax.Array) -> jax.Array:
         """Weight of every schedule point at one input vector, shape ``(point,)``."""
-        if self.schedule is None:
-            return jnp.ones(1)
-        grid = self.grid
-        value = jnp.clip(inputs[self.schedule], grid[0], grid[-1])
-        after = jnp.clip((value - grid[:-1]) / jnp.diff(grid), 0.0, 1.0)
-        one = jnp.ones(1)
-        return jnp.concatenate([one, after]) - jnp.concatenate([after, 0 * one])
+        return hats(self.grid, inputs[self.schedule or 0])
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""

@@ -173,7 +173,7 @@ class Parametrisation(eqx.Module):
 
     def _standardised(self, inputs: jax.Array) -> jax.Array:
         region = self.model.region
-        return (inputs - region.mean) / jnp.where(region.std > 0, region.std, 1.0)
+        return (inputs - region.mean) / region.scale
 
     @property
     def _constant_columns(self) -> IntArray:
@@ -193,7 +193,7 @@ class Parametrisation(eqx.Module):
 
     def _linear(self, scheduled: jax.Array, constant: jax.Array) -> LinearModel:
         f, region = self.model.f, self.model.region
-        std = jnp.where(region.std > 0, region.std, 1.0)
+        std = region.scale
         change = jnp.zeros((len(f.grid), len(self.rows), len(std)))
         change = change.at[:, :, np.array(self.scheduled, dtype=int)].set(scheduled[..., :-1])
         change = change.at[:, :, self._constant_columns].set(constant * self._free)
@@ -210,7 +210,7 @@ class Parametrisation(eqx.Module):
         """Decay and frequency change by factors, so that no latent state becomes unstable."""
         now, region = poles(self.model), self.model.region
         columns = np.array(self.driven, dtype=int)
-        std = jnp.where(region.std > 0, region.std, 1.0)[columns]
+        std = region.scale[columns]
         decay, frequency = jnp.exp(dynamics) * jnp.stack([now.decay, now.frequency])
         # Per unit of an input's spread a pair moves by about one.
         size = jnp.hypot(now.decay, now.frequency)

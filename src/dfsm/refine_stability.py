@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.correction import operating_points
+from dfsm.correction import operating_points, state_matrices
 from dfsm.latents import at_rest
+from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.stability import eigen, fastest_growth
 from dfsm.types import Array, ComplexArray
@@ -40,7 +41,7 @@ class StabilityKept:
 
     def __init__(self, parameters: Parametrisation, samples: int) -> None:
         self._parameters = parameters
-        self._points = jnp.asarray(operating_points(parameters.model)[1])
+        self._points = operating_points(parameters.model)[1]
         self._weight = np.sqrt(_SHARE * samples) / _MARGIN
         self._idle = False
         self._idle = not np.isfinite(self.cost(np.zeros(parameters.size)))
@@ -49,8 +50,8 @@ class StabilityKept:
         """Sum of squares, infinite where the model is unstable."""
         if self._idle:
             return 0.0
-        growth, worst = self._eigen(weights)[0], -np.inf
-        model = self._parameters.at(jnp.asarray(weights))
+        model, worst = self._parameters.at(jnp.asarray(weights)), -np.inf
+        growth = self._eigen(model)[0]
         if model.e is None:
             worst = fastest_growth(model.f, model.signals.state_columns)
         if max(worst, growth.max()) > 0:
@@ -61,40 +62,27 @@ class StabilityKept:
         """JᵀJ and Jᵀr."""
         if self._idle:
             return np.zeros((len(weights), len(weights))), np.zeros(len(weights))
-        growth, left, right = self._eigen(weights)
+        growth, left, right = self._eigen(self._parameters.at(jnp.asarray(weights)))
         r = self._excess(growth)
         vectors = jnp.asarray(left), jnp.asarray(right)
-        slopes = _slopes(self._parameters, jnp.asarray(weights), self._points, *vectors)
+        slopes = _slopes(
+            self._parameters, jnp.asarray(weights), jnp.asarray(self._points), *vectors
+        )
         J = np.where(r > 0, self._weight, 0.0)[:, None] * np.asarray(slopes)
         return J.T @ J, J.T @ r
 
     def _excess(self, growth: Array) -> Array:
         return self._weight * np.maximum(growth + _MARGIN, 0.0)
 
-    def _eigen(self, weights: Array) -> tuple[Array, ComplexArray, ComplexArray]:
+    def _eigen(self, model: DFSM) -> tuple[Array, ComplexArray, ComplexArray]:
         """Fastest growth at every point, and the eigenvectors to it, scaled so that wᴴ v = 1."""
-        found = _state_matrices(self._parameters, jnp.asarray(weights), self._points)
         growth, left, right = [], [], []
-        for values, w, v in map(eigen, np.asarray(found)):
+        for values, w, v in map(eigen, state_matrices(model, self._points)):
             k = int(np.argmax(values.real))
             growth.append(values[k].real)
             left.append(w[k])
             right.append(v[k])
         return np.array(growth), np.array(left), np.array(right)
-
-
-@eqx.filter_jit
-def _state_matrices(
-    parameters: Parametrisation, weights: jax.Array, points: jax.Array
-) -> jax.Array:
-    """A at every point, shape ``(point, state, state)``."""
-    model = parameters.at(weights)
-
-    def at_point(inputs: jax.Array) -> jax.Array:
-        x, *others = model.split(at_rest(model, inputs))
-        return jax.jacfwd(lambda x: model.derivative(x, *others))(x)
-
-    return jax.vmap(at_point)(points)
 
 
 @eqx.filter_jit

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.corrective.functions import Perceptron
+from dfsm.integrate import exogenous_groups
 from dfsm.latents import Poles, add_latents, as_states
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
@@ -59,7 +60,7 @@ def start_latents(
     rows = list(Parametrisation.of(model, spread).rows)
     left = np.concatenate([_left_over(model, r)[:, rows] / spread[rows] for r in records])
 
-    std = np.where(np.asarray(region.std)[:n_uw] > 0, np.asarray(region.std)[:n_uw], 1.0)
+    std = np.asarray(region.scale)[:n_uw]
     names = [c.name for c in s.inputs[:n_uw]]
     columns = [i for i, n in enumerate(names) if drivers is None or n in drivers]
     each = np.repeat(decay, len(columns))
@@ -109,7 +110,7 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
     directions = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
     network = Perceptron(
         shift=region.mean,
-        scale=jnp.where(region.std > 0, region.std, 1.0),
+        scale=region.scale,
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
@@ -124,10 +125,8 @@ def _poles(decay: Array, drive: Array, middle: Array) -> Poles:
 
 def _left_over(model: DFSM, record: Record) -> Array:
     """Recorded minus modelled derivatives at the ends of steps."""
-    s = model.signals
-    v = record.inputs[2 * record.before :: 2]
-    u, w, p = np.split(v, np.cumsum([len(s.controls), len(s.disturbances)]), axis=1)
-    return record.slopes - np.asarray(model.derivative(record.states, u, w, p))
+    exogenous = exogenous_groups(model, jnp.asarray(record.inputs[2 * record.before :: 2]))
+    return record.slopes - np.asarray(model.derivative(record.states, *exogenous))
 
 
 def _regress(paths: Array, targets: Array) -> Array:

@@ -6,12 +6,11 @@ states exist nowhere else.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 
-from dfsm.errors import DfsmWarning
+from dfsm.errors import hushed
 from dfsm.latents import latent_path
 from dfsm.model import DFSM
 from dfsm.samples import FitSettings, Samples
@@ -39,8 +38,7 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, choices: FitSet
     """
     # Its outputs are what is going to be fitted.
     model = replace(model, signals=replace(model.signals, outputs=()))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DfsmWarning)
+    with hushed():
         found = simulate(model, list(data), start=choices.start, stop=choices.stop)
     inputs = samples.inputs.copy()
     names = model.signals.names("states")

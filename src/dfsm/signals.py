@@ -12,10 +12,12 @@ import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
 import dfsm.jax_setup  # noqa: F401
+from dfsm.density import squared_distance
 from dfsm.derivatives import DerivativeSettings, StateSpec
 from dfsm.errors import DfsmError, near_matches
 from dfsm.features import Feature, with_features
 from dfsm.read.wind import CORRECTED_WIND, undisturbed_rotor_wind
+from dfsm.schedule import hats
 from dfsm.settings import require, settings
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.units import SPEEDS
@@ -231,16 +233,24 @@ class Region(eqx.Module):
     fixed: int = eqx.field(static=True, default=0)
     schedule: int | None = eqx.field(static=True, default=None)
 
+    @property
+    def scale(self) -> jax.Array:
+        """What standardised inputs are divided by: `std`, and 1 for what does not vary."""
+        return jnp.where(self.std > 0, self.std, 1.0)
+
     def outside(self, inputs: ArrayLike) -> jax.Array:
         """Tell which samples of ``(..., input)`` are outside the training data.
 
         Either an input is outside its range, or all together are farther from what occurred
         together than samples of a new run usually are.
         """
+        return jnp.any(self.beyond(inputs), axis=-1) | (self.distance(inputs) > 1)
+
+    def beyond(self, inputs: ArrayLike) -> jax.Array:
+        """Tell which of ``(..., input)`` are outside their own training range."""
         slack = 1e-9 * (self.high - self.low)
         inputs = jnp.asarray(inputs)
-        beyond = jnp.any((inputs < self.low - slack) | (inputs > self.high + slack), axis=-1)
-        return beyond | (self.distance(inputs) > 1)
+        return (inputs < self.low - slack) | (inputs > self.high + slack)
 
     def distance(self, inputs: ArrayLike, chosen: bool = False) -> jax.Array:
         """Squared distance of ``(..., input)`` from the training data: 1 is as far as is usual.
@@ -259,22 +269,8 @@ class Region(eqx.Module):
         if not self.whitening.size:
             return jnp.zeros(inputs.shape[:-1])
         W = self.whitening[:, self.fixed :] if chosen else self.whitening
-        total = jnp.zeros(inputs.shape[:-1])
-        shares = self._shares(inputs)
-        for k, (middle, rows) in enumerate(zip(self.operating, W, strict=True)):
-            apart = (inputs - middle) @ rows.T
-            total += shares[..., k] * jnp.sum(apart**2, axis=-1)
-        return total
-
-    def _shares(self, inputs: jax.Array) -> jax.Array:
-        """Hat functions of the schedule, ``(..., point)``."""
-        one = jnp.ones((*inputs.shape[:-1], 1))
-        if self.schedule is None:
-            return one
-        value = inputs[..., self.schedule, None]
-        after = jnp.clip((value - self.grid[:-1]) / jnp.diff(self.grid), 0.0, 1.0)
-        before = jnp.concatenate([one, after], axis=-1)
-        return before - jnp.concatenate([after, 0 * one], axis=-1)
+        shares = hats(self.grid, inputs[..., self.schedule or 0])
+        return squared_distance(inputs, shares, self.operating, W)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dfsm.errors import DfsmWarning, printable
+from dfsm.errors import hushed, printable
 from dfsm.progress import show_progress
 
 if TYPE_CHECKING:
@@ -24,9 +23,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard out
 @contextmanager
 def working(quiet: bool) -> Iterator[None]:
     """Long work: bars on a terminal; with --quiet neither these nor warnings."""
-    with show_progress(not quiet), warnings.catch_warnings():
-        if quiet:
-            warnings.simplefilter("ignore", DfsmWarning)
+    with show_progress(not quiet), hushed() if quiet else nullcontext():
         yield
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 import dfsm
 from dfsm.derivatives import differentiate
-from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.files import json_value
 from dfsm.fit import fit
 from dfsm.model import DFSM
@@ -132,8 +132,7 @@ def try_out(course: Course, candidate: Candidate) -> tuple[Outcome, DFSM | None]
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DfsmWarning)
             result = fit(course.training, choices, candidate.refine)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DfsmWarning)  # the outcome tells
+        with hushed():  # the outcome tells
             outcome = _judge(result.model, course, choices)
     except DfsmError as error:
         return Outcome(message=str(error)), None

@@ -6,7 +6,6 @@ the start of the window. States and outputs are then compared along the model's 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
@@ -22,7 +21,7 @@ from dfsm.comparison import (
     Validation,
 )
 from dfsm.derivatives import differentiate
-from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.errors import DfsmError, hushed
 from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.intervals import Intervals
 from dfsm.latents import latent_path
@@ -180,8 +179,7 @@ def _simulate_warm(
     options: SimulationSettings | None,
 ) -> Simulation:
     """Simulate twice: the first call may compile, the second tells what a simulation costs."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DfsmWarning)
+    with hushed():
         simulate(model, run, start=window[0], stop=window[1], options=options)
         return simulate(model, run, start=window[0], stop=window[1], options=options)
 

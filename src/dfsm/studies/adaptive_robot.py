@@ -18,13 +18,13 @@ from dfsm.control import DirectTranscription, OptimalControlProblem, Solution, s
 from dfsm.control.adaptive import AdaptiveResult, AdaptiveSettings, optimise_adaptively
 from dfsm.corrective import GP, CorrectiveChoice
 from dfsm.derivatives import StateSpec
+from dfsm.errors import hushed
 from dfsm.excitation import RandomKnots, Uniform
 from dfsm.fit import fit
 from dfsm.model import DFSM
 from dfsm.samples import FitSettings
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot
-from dfsm.studies.assess import hushed
 from dfsm.trajectory import Trajectory
 
 ROBOT = two_link_robot()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from dfsm.errors import DfsmWarning
+from dfsm.errors import hushed
 from dfsm.model import DFSM
 from dfsm.simulate import Status, simulate
 from dfsm.simulators import ODESystem
@@ -131,11 +129,3 @@ def roll(model: DFSM, runs: Sequence[Trajectory]) -> Rollouts:
         count = len(simulated) - (simulation.status is not Status.COMPLETED)
         errors[k, :count] = simulated[:count] - recorded[k, :count]
     return Rollouts(runs[0].time, errors, np.array([s.outside for s in found]))
-
-
-@contextmanager
-def hushed() -> Iterator[None]:
-    """Without the warnings about data and rollouts: a study tells what became of them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DfsmWarning)
-        yield

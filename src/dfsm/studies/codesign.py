@@ -19,13 +19,13 @@ import numpy as np
 from dfsm.control import DirectTranscription, OptimalControlProblem, Solution, solve
 from dfsm.corrective import MLP, CorrectiveChoice
 from dfsm.derivatives import StateSpec
+from dfsm.errors import hushed
 from dfsm.excitation import RandomKnots, Uniform
 from dfsm.fit import fit
 from dfsm.model import DFSM
 from dfsm.samples import FitSettings
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot_with_gravity
-from dfsm.studies.assess import hushed
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from dfsm.corrective import GP, MLP, RBF, CorrectiveChoice
+from dfsm.errors import hushed
 from dfsm.fit import fit
 from dfsm.progress import track
 from dfsm.simulators import two_link_robot
-from dfsm.studies.assess import Assessed, Rollouts, assess, hushed, roll
+from dfsm.studies.assess import Assessed, Rollouts, assess, roll
 from dfsm.studies.multi_fidelity import choices
 from dfsm.trajectory import Trajectory
 

@@ -16,13 +16,14 @@ import numpy as np
 
 from dfsm.corrective import RBF, CorrectiveChoice
 from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.errors import hushed
 from dfsm.excitation import RandomKnots, Uniform
 from dfsm.fit import FitResult, fit
 from dfsm.progress import track
 from dfsm.samples import FitSettings
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot, two_link_robot_with_gravity
-from dfsm.studies.assess import Assessed, Rollouts, assess, hushed, roll, slope, states
+from dfsm.studies.assess import Assessed, Rollouts, assess, roll, slope, states
 from dfsm.studies.extraction import DELTA, STATES
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array

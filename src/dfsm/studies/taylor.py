@@ -15,13 +15,14 @@ import numpy as np
 
 from dfsm.corrective import RBF
 from dfsm.derivatives import DerivativeSettings, StateSpec
+from dfsm.errors import hushed
 from dfsm.fit import fit
 from dfsm.linear import LTI, fit_linear
 from dfsm.progress import track
 from dfsm.samples import FitSettings, extract, select
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot_with_gravity
-from dfsm.studies.assess import hushed, slope
+from dfsm.studies.assess import slope
 from dfsm.studies.extraction import DURATION, STATES, around, holding_torques
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array

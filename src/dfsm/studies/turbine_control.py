@@ -367,11 +367,8 @@ def optimise(
     model = region.own if case is PAPER else region.model
     horizon = (region.start, region.start + size.duration)
     solution = solve(problem(model, wind, case, most_pitch, horizon), method)
-    run, space = solution.trajectory, model.region
-    names = [c.name for c in model.signals.inputs]
-    values, low, high = run.select(names).values, np.asarray(space.low), np.asarray(space.high)
-    slack = 1e-9 * (high - low)
-    beyond = ((values < low - slack) | (values > high + slack)).mean(axis=0)
+    run, names = solution.trajectory, [c.name for c in model.signals.inputs]
+    beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
     outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
     recorded = wind.window(run.time[0], run.time[-1])
     return Result(region.name, wind.name, case, most_pitch, inside, solution, recorded, outside)
