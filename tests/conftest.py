@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -33,6 +34,11 @@ CONFIG: dict[str, Any] = {
 
 # Files that take minutes; workers take them first, so that none is left alone with one at the end.
 LONG = ("test_results", "test_parameters", "test_studies", "test_adaptive", "test_latents")
+
+# A job in the background may have been told to ignore Ctrl-C, and would hand that on to commands
+# whose reaction to it is tested.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -85,27 +85,36 @@ def test_combinations_that_never_occurred_are_outside(model):
     assert not bool(model.region.outside((low + high) / 2))
 
 
-def test_what_is_chosen_adds_to_what_is_given(model):
-    rng = np.random.default_rng(0)
-    inputs = rng.normal(size=(20, 3))
-    whole, chosen = (np.asarray(model.region.distance(inputs, chosen=c)) for c in (False, True))
-    assert (chosen <= whole + 1e-12).all()
+def test_what_is_chosen_takes_what_disturbances_leave(model):
+    region = model.region
+    mean, std = np.asarray(region.mean), np.asarray(region.std)
+    inputs = mean + std * np.random.default_rng(0).normal(size=(500, 3))
+    whole, chosen = np.asarray(region.distance(inputs)), np.asarray(region.distance_chosen(inputs))
+    # As far as is usual is the same for both, but where the disturbance itself is far off.
+    near = np.abs(inputs[:, 1] - mean[1]) < std[1]
+    assert 20 < (whole[near] > 1).sum() < near.sum() - 20
+    np.testing.assert_array_equal(chosen[near] > 1, whole[near] > 1)
     # The nearest controls and states to given disturbances add nothing.
     if model.schedule is None:
-        W, mean = np.asarray(model.region.whitening[0]), np.asarray(model.region.operating[0])
+        W = np.asarray(region.whitening[0])
         w = 0.7
         rows = W[1:]
         best = np.linalg.lstsq(rows[:, [0, 2]], -rows[:, 1] * (w - mean[1]), rcond=None)[0]
         point = np.array([best[0] + mean[0], w, best[1] + mean[2]])
-        assert float(model.region.distance(point, chosen=True)) == pytest.approx(0, abs=1e-12)
+        assert float(region.distance_chosen(point)) == pytest.approx(0, abs=1e-12)
+        far = mean + np.array([0.0, 50.0 * std[1], 0.0])
+        added = float(region.distance(far)) - float(np.sum((W[0] @ (far - mean)) ** 2))
+        assert float(region.distance_chosen(far)) == pytest.approx(added / 0.2)
 
 
-def test_slopes_are_exact(model):
+@pytest.mark.parametrize("name", ["distance", "distance_chosen"])
+def test_slopes_are_exact(model, name):
+    distance = getattr(model.region, name)
     point = jnp.array([0.3, 0.1, -0.4])
-    slopes = jax.grad(model.region.distance)(point)
+    slopes = jax.grad(distance)(point)
     for k in range(3):
         step = 1e-6 * np.eye(3)[k]
-        there, here = (float(model.region.distance(point + s)) for s in (step, -step))
+        there, here = (float(distance(point + s)) for s in (step, -step))
         assert float(slopes[k]) == pytest.approx((there - here) / 2e-6, rel=1e-6, abs=1e-6)
 
 
@@ -134,7 +143,7 @@ def test_an_optimum_stays_near_the_data_if_asked(model):
     assert kept.solved
     assert free.outside > 0.5
     inputs = kept.trajectory.select(["u", "w", "q"]).values
-    assert np.asarray(model.region.distance(inputs, chosen=True)).max() < 1 + 1e-6
+    assert np.asarray(model.region.distance_chosen(inputs)).max() < 1 + 1e-6
     assert kept.objective > free.objective
 
 

@@ -112,9 +112,9 @@ def test_staying_inside_keeps_near_the_data_at_a_cost(region: Region, found: Con
     assert free.solution.objective < inside.solution.objective
     assert inside.solution.objective == pytest.approx(free.solution.objective, rel=0.1)
     names = [c.name for c in region.model.signals.inputs]
-    distance = region.model.region.distance
+    chosen = region.model.region.distance_chosen
     for r, near in ((free, False), (inside, True)):
-        far = np.asarray(distance(r.run.select(names).values, chosen=True)).max()
+        far = np.asarray(chosen(r.run.select(names).values)).max()
         assert (far < 1 + 1e-4) == near
 
 

@@ -200,6 +200,10 @@ def radians_per_second(speed: Channel) -> float:
     return SPEEDS[speed.unit]
 
 
+# Of the squared distance that is usual: what disturbances leave to controls and states at least.
+_LEFT = 0.2
+
+
 class Region(eqx.Module):
     """Where the training data lie, and what they look like along the schedule.
 
@@ -252,25 +256,32 @@ class Region(eqx.Module):
         inputs = jnp.asarray(inputs)
         return (inputs < self.low - slack) | (inputs > self.high + slack)
 
-    def distance(self, inputs: ArrayLike, chosen: bool = False) -> jax.Array:
+    def distance(self, inputs: ArrayLike) -> jax.Array:
         """Squared distance of ``(..., input)`` from the training data: 1 is as far as is usual.
 
         Mahalanobis's, Σ_k h_k |W_k (I − μ_k)|² over the operating points k with hat functions h of
-        the schedule. 99.9 % of the training samples are nearer, measured by the other runs.
+        the schedule. Half of the training runs have 99.9 % of their samples nearer, measured by
+        the other runs.
+        """
+        return self._squared(jnp.asarray(inputs), slice(None))
 
-        Parameters
-        ----------
-        inputs
-            I, shape ``(..., input)``.
-        chosen
-            Count only what controls and states add to the distance of the disturbances.
+    def distance_chosen(self, inputs: ArrayLike) -> jax.Array:
+        """What controls and states add to the distance, over what the disturbances leave for them.
+
+        1 where all of ``(..., input)`` are as far from the training data as is usual. Disturbances
+        that are unusual themselves leave at least a fifth: somewhat more than controls and states
+        of the training runs take on average.
         """
         inputs = jnp.asarray(inputs)
+        given = self._squared(inputs, slice(self.fixed))
+        added = self._squared(inputs, slice(self.fixed, None))
+        return added / jnp.maximum(1 - given, _LEFT)
+
+    def _squared(self, inputs: jax.Array, rows: slice) -> jax.Array:
         if not self.whitening.size:
             return jnp.zeros(inputs.shape[:-1])
-        W = self.whitening[:, self.fixed :] if chosen else self.whitening
         shares = hats(self.grid, inputs[..., self.schedule or 0])
-        return squared_distance(inputs, shares, self.operating, W)
+        return squared_distance(inputs, shares, self.operating, self.whitening[:, rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,15 +136,15 @@ class Signals:
 
     @property
     def distance(self) -> Any:
-        """Squared distance of states and controls from the training data, 1 where it is unusual.
+        """How far states and controls are from the training data: 1 is as far as is usual.
 
-        See `Region.distance`; 0 without a surrogate.
+        See `Region.distance_chosen`; 0 without a surrogate.
         """
         x, u, w, p = self._raw
         region = self._plant.region
         if region is None:
             return jnp.zeros(())
-        return region.distance(jnp.concatenate([u, w, x, p]), chosen=True)
+        return region.distance_chosen(jnp.concatenate([u, w, x, p]))
 
     @property
     def y(self) -> Group:

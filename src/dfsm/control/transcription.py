@@ -47,7 +47,7 @@ class DirectTranscription:
         Meshes tried after the first.
     stay_inside
         Keep states, controls and free parameters inside the training range of a surrogate, and
-        their combinations near what occurred there, see `Region.distance`.
+        their combinations near what occurred there, see `Region.distance_chosen`.
     tolerance
         Of the scaled optimality conditions.
     most_iterations
