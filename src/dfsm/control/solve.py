@@ -80,19 +80,22 @@ def solve(
         by JAX; bounds or settings that contradict each other.
     """
     method = method or DirectTranscription()
-    if method.stay_inside:
-        problem = _kept_inside(problem)
-    record = _solve_meshes(problem, method, guess)
-    return _solution(problem, record, simulate)
-
-
-def _kept_inside(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with states and controls no farther from the training data than is usual."""
     region = problem.plant.region
-    if region is None or not region.whitening.size:
-        return problem
+    if not method.stay_inside or region is None or not region.whitening.size:
+        return _solution(problem, _solve_meshes(problem, method, guess), simulate)
     kept = {"distance from the training data": (_distance, None, 1.0)}
-    return replace(problem, constraints={**problem.constraints, **kept})
+    inside = replace(problem, constraints={**problem.constraints, **kept})
+    if isinstance(guess, Solution):
+        return _solution(inside, _solve_meshes(inside, method, guess), simulate)
+    # The distance bends the feasible set: from the optimum without it the solver needs tens of
+    # iterations, from a guess hundreds.
+    first = _solve_meshes(problem, method, guess)
+    free = _solution(problem, first, simulate=False)
+    if not free.solved:
+        return _solution(problem, first, simulate)
+    record = _solve_meshes(inside, method, free)
+    record.prepend(first)
+    return _solution(inside, record, simulate)
 
 
 def _distance(signals: Signals) -> Any:
@@ -225,6 +228,13 @@ class _Record:
                 "iterations": outcome.iterations,
             }
         )
+
+    def prepend(self, other: _Record) -> None:
+        """Count the meshes of another record before these."""
+        self.compile += other.compile
+        self.solve += other.solve
+        self.iterations += other.iterations
+        self.meshes = [*other.meshes, *self.meshes]
 
 
 def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -> Solution:

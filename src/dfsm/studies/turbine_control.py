@@ -340,7 +340,7 @@ def optimise(
     case: Case,
     most_pitch: float,
     size: ControlStudySize,
-    inside: bool = False,
+    left: Result | None = None,
 ) -> Result:
     """Solve the problem for one wind series and one limit of the platform pitch.
 
@@ -354,9 +354,11 @@ def optimise(
         Bounds.
     size
         Nodes, horizon and tolerance.
-    inside
-        Keep states and controls inside the training data.
+    left
+        The result whose solution left the training data: stay inside now, and start from it.
     """
+    inside = left is not None
+    guess = left.solution if left is not None and left.solution.solved else None
     method = DirectTranscription(
         scheme="trapezoidal",
         mesh=size.points - 1,
@@ -366,7 +368,7 @@ def optimise(
     )
     model = region.own if case is PAPER else region.model
     horizon = (region.start, region.start + size.duration)
-    solution = solve(problem(model, wind, case, most_pitch, horizon), method)
+    solution = solve(problem(model, wind, case, most_pitch, horizon), method, guess)
     run, names = solution.trajectory, [c.name for c in model.signals.inputs]
     beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
     outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
@@ -394,7 +396,7 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
                 results += found
             left = any((r.solution.outside or 0.0) > _LEAVES for r in found)
             if size.inside and left:
-                results += [optimise(region, wind, own, p, size, True) for p in size.pitch_limits]
+                results += [optimise(region, wind, own, r.most_pitch, size, r) for r in found]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
