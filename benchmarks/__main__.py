@@ -1,7 +1,7 @@
 """Run the measurements and print one JSON object.
 
-python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [control]
-    [codesign] [peer]
+python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [limits]
+    [control] [codesign] [peer]
 
 Without names all but `peer`, which makes an environment of its own and installs jax-sysid there.
 """
@@ -20,6 +20,7 @@ from benchmarks import (
     codesign,
     control,
     derivatives,
+    limits,
     parameters,
     peer,
     rollouts,
@@ -35,6 +36,7 @@ PARTS = {
     "parameters": parameters.run,
     "scaling": scaling.run,
     "rollouts": rollouts.run,
+    "limits": limits.run,
     "control": control.run,
     "codesign": codesign.run,
     "peer": peer.run,
