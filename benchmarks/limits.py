@@ -46,7 +46,7 @@ def run() -> dict[str, Any]:
     tests = [
         with_thrust(r) for r in (turbine.runs(winds, range(9, 11)), turbine.perturbed(testing=True))
     ]
-    field = None
+    field, same = None, _sized(turbine.REFINEMENT.network)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)
         for name, runs, choices, refinement in variants(turbine):
@@ -60,7 +60,7 @@ def run() -> dict[str, Any]:
                 "closed loop": errors([refined.model], tests[0]),
                 "perturbed": errors([refined.model], tests[1]),
             }
-            if refinement == turbine.REFINEMENT and choices == plain(turbine):
+            if name == same:
                 field = field_shares(refined.model, runs)
         return {"variants": found, "field": field, "braking": braking(turbine)}
 
@@ -81,10 +81,13 @@ def variants(
         few = [*turbine.runs(winds, range(1, seeds + 1)), *perturbed]
         yield f"{seeds} seeds per wind speed", few, full, refinement
     for units in UNITS:
-        name = f"8 seeds, network of {units}" if units else "8 seeds, no network"
-        yield name, every, full, replace(refinement, network=units)
+        yield _sized(units), every, full, replace(refinement, network=units)
     given = replace(full, disturbances=(*full.disturbances, THRUST.name))
     yield "8 seeds, thrust given", with_thrust(every), given, refinement
+
+
+def _sized(units: int) -> str:
+    return f"8 seeds, network of {units}" if units else "8 seeds, no network"
 
 
 def with_thrust(runs: Runs) -> list[dfsm.Trajectory]:
