@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import dfsm
+from dfsm.simulators.two_link_robot import holding_torques
 from dfsm.types import Array
 
 # Masses in kg by where they lie to the trained ones.
@@ -68,7 +69,7 @@ def runs(
     masses: Sequence[float], each: int, seed: int, closer: float = 1.0
 ) -> list[dfsm.Trajectory]:
     """Runs with every mass in turn, from random states under random torques."""
-    centre, push = torques(2.5), closer * TORQUE
+    centre, push = holding_torques(SYSTEM, HELD, [2.5]), closer * TORQUE
     return SYSTEM.campaign(
         each * len(masses),
         TIME,
@@ -87,13 +88,6 @@ def settings(parameters: tuple[str, ...] = ("m2",)) -> dfsm.FitSettings:
         parameters=parameters,
         nonlinear_only=False,
     )
-
-
-def torques(mass: float) -> Array:
-    """What holds the arm at `HELD`, in N m: the accelerations are linear in the torques."""
-    point = (HELD, np.zeros(2), np.zeros(0), np.array([mass]))
-    accelerations = np.asarray(SYSTEM.f(*point))[[1, 3]]
-    return -np.linalg.solve(SYSTEM.jacobians(*point)[1][[1, 3]], accelerations)
 
 
 def errors(model: dfsm.DFSM, tests: Sequence[dfsm.Trajectory]) -> dict[str, float | None]:
@@ -131,8 +125,9 @@ def _relative(found: Sequence[Any], truth: Sequence[Array]) -> float:
 
 def poles(model: dfsm.DFSM, mass: float) -> dict[str, Any]:
     """Eigenvalues of ∂f/∂ξ in 1/s where the arm is held with one mass."""
-    true = SYSTEM.eigenvalues(HELD, torques(mass), (), [mass])
-    A = model.jacobians(HELD[[0, 2, 1, 3]], torques(mass), (), [mass])[0]
+    holding = holding_torques(SYSTEM, HELD, [mass])
+    true = SYSTEM.eigenvalues(HELD, holding, (), [mass])
+    A = model.jacobians(HELD[[0, 2, 1, 3]], holding, (), [mass])[0]
     found = np.linalg.eigvals(A)
     found = found[np.argsort(-found.real)]
     return {

@@ -172,6 +172,45 @@ def leak_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def limits_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors with fewer runs, other sizes of the network, and the thrust given."""
+    lines = [
+        "| model | training runs | training, validation | pitch | pitch rate | rotor speed "
+        "| perturbed: pitch, speed |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, found in figures["variants"].items():
+        closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
+        pair = ", ".join(f"{found[k] ** 0.5:.3f}" for k in ("training", "validation"))
+        cells = [str(found["runs"]), pair, *(_two(v) for v in closed.values())]
+        cells.append(", ".join(_two(other[c]) for c in ("PtfmPitch", "GenSpeed")))
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+def field_table(figures: Mapping[str, Any]) -> list[str]:
+    """What explains the slow part of what the model's derivatives leave over."""
+    lines = [
+        "| left over, below 0.05 Hz | RotWind and its slopes | and the rest of the field "
+        "| and the rest, shifted in time |",
+        "|---|---|---|---|",
+    ]
+    for name, found in figures["field"].items():
+        three, whole = (f"{100 * found[k]:.0f} %" for k in ("three signals", "whole field"))
+        middle, most = (f"{100 * v:.0f} %" for v in found["shifted"])
+        lines.append(f"| {name} | {three} | {whole} | {middle} (95th percentile: {most}) |")
+    return lines
+
+
+def braking_table(figures: Mapping[str, Any]) -> list[str]:
+    """Effect of torque on the speed's derivative, true and as derivatives teach it."""
+    lines = ["| torque's effect (10⁻⁵ rpm/s per kN m) | weakest | strongest |", "|---|---|---|"]
+    for name, pair in figures["braking"].items():
+        cells = [f"{1e5 * v:.2g}".replace("-", "\N{MINUS SIGN}") for v in pair]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
 def sweep_table(figures: Mapping[str, Any]) -> list[str]:
     """The sweep of constant winds in one line per figure."""
     found = figures["sweep"]
@@ -333,6 +372,7 @@ ROLLOUT_TABLES = {
     "sweep": sweep_table,
     "leak": leak_table,
 }
+LIMITS_TABLES = {"limits": limits_table, "field": field_table, "braking": braking_table}
 CODESIGN_TABLES = {"codesign": codesign_table, "adaptive": adaptive_table}
 # By the part of the figures that each shows.
 CONTROL_TABLES = {
@@ -359,14 +399,15 @@ def main() -> None:
     """Write the tables that the figures hold."""
     figures = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     tables = {name: table(figures[name]) for name, table in TABLES.items() if name in figures}
-    if "rollouts" in figures:
-        for name, table in ROLLOUT_TABLES.items():
-            tables[name] = table(figures["rollouts"])
+    for part, group in (
+        ("rollouts", ROLLOUT_TABLES),
+        ("limits", LIMITS_TABLES),
+        ("codesign", CODESIGN_TABLES),
+    ):
+        if part in figures:
+            tables |= {name: table(figures[part]) for name, table in group.items()}
     if "peer" in figures:
         tables["peer"] = rollouts_table(figures["peer"])
-    if "codesign" in figures:
-        for name, table in CODESIGN_TABLES.items():
-            tables[name] = table(figures["codesign"])
     if "control" in figures:
         for name, (part, table) in CONTROL_TABLES.items():
             tables[name] = table(figures["control"][part])

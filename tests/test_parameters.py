@@ -17,6 +17,7 @@ import dfsm
 from conftest import write_config
 from dfsm.config import parse_config
 from dfsm.read import read, write_table
+from dfsm.simulators.two_link_robot import holding_torques
 from systems import SPRING
 
 ROOT = Path(__file__).parents[1]
@@ -169,7 +170,7 @@ def test_validation_and_report_show_the_mass(models, tests, tmp_path):
 
 def test_jacobians_depend_on_the_mass_and_leave_it_out(models):
     control = pytest.importorskip("control")
-    model, torques = models[TOLD], parameters.torques(2.4)
+    model, torques = models[TOLD], holding_torques(parameters.SYSTEM, parameters.HELD, [2.4])
     A, B, _, _ = model.jacobians(HELD, torques, (), [2.4])
     assert A.shape == (4, 4)
     assert B.shape == (4, 2)
@@ -184,7 +185,7 @@ def test_jacobians_depend_on_the_mass_and_leave_it_out(models):
 def test_slopes_in_the_mass_are_those_of_the_arm(models):
     # What co-design needs: ∂f/∂p, by differentiating the model like any function.
     order = [0, 2, 1, 3]
-    torques, nothing = parameters.torques(2.4), np.zeros(0)
+    torques, nothing = holding_torques(parameters.SYSTEM, parameters.HELD, [2.4]), np.zeros(0)
     true = jax.jacfwd(lambda p: parameters.SYSTEM.f(parameters.HELD, torques, nothing, p))
     found = jax.jacfwd(lambda p: models[TOLD].derivative(HELD, torques, nothing, p))
     mass = np.array([2.4])

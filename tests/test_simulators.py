@@ -27,6 +27,7 @@ from dfsm import (
     two_link_robot,
     two_link_robot_with_gravity,
 )
+from dfsm.simulators.two_link_robot import holding_torques
 from dfsm.waveforms import held
 
 TIME = np.linspace(0, 1, 201)
@@ -157,6 +158,13 @@ def test_the_arm_with_gravity_rests_where_it_should():
     still = Trajectory(TIME, np.tile([*AT_REST, *HOLDING], (201, 1)), arm.states + arm.controls)
     residual = np.abs(arm.derivative(still)).max()
     assert 1e-4 < residual < 4.5e-4
+
+
+@pytest.mark.parametrize("mass", [(), (1.7,)])
+def test_the_arm_is_held_by_its_torques(mass):
+    arm = two_link_robot_with_gravity(vary_mass=bool(mass))
+    torques = holding_torques(arm, AT_REST, mass)
+    assert np.allclose(gravity_arm(AT_REST, torques, *mass)[0], 0, atol=1e-12)
 
 
 def test_the_arm_without_gravity_rests_anywhere():

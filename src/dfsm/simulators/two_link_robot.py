@@ -7,11 +7,15 @@ gravity stays predictable over its 3 s manoeuvre: use it for long rollouts and o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dfsm.simulators.ode import ODESystem
 from dfsm.trajectory import Channel
+from dfsm.types import Array
 
 # Moments of inertia in kg m², gravity in m/s², lengths in m, masses in kg.
 _J1, _J2, _GRAVITY, _L1, _L2, _M1, _M2 = 0.12, 0.15, 9.81, 0.6, 0.8, 3.0, 2.5
@@ -57,6 +61,28 @@ def two_link_robot_with_gravity(vary_mass: bool = False) -> ODESystem:
         parameters=(Channel("m2", "kg"),) if vary_mass else (),
         name="two-link robot with gravity",
     )
+
+
+def holding_torques(
+    robot: ODESystem, state: Sequence[float] | Array, parameters: Sequence[float] | Array = ()
+) -> Array:
+    """Torques that hold the arm with gravity where it rests, in N m, shape ``(2,)``.
+
+    Its accelerations are affine in the torques, so that one step from none is exact.
+
+    Parameters
+    ----------
+    robot
+        From `two_link_robot_with_gravity`.
+    state
+        Its states, the rates zero.
+    parameters
+        The mass of the second link in kg, if it varies.
+    """
+    x, p = (np.array(values, dtype=float) for values in (state, parameters))
+    point = (x, np.zeros(2), np.zeros(0), p)
+    left = np.asarray(robot.f(*point))[[1, 3]]
+    return -np.linalg.solve(robot.jacobians(*point)[1][[1, 3]], left)
 
 
 def _with_gravity(x: jax.Array, u: jax.Array, w: jax.Array, _p: jax.Array) -> jax.Array:

@@ -26,8 +26,8 @@ from dfsm.model import DFSM
 from dfsm.samples import FitSettings
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot_with_gravity
+from dfsm.simulators.two_link_robot import holding_torques
 from dfsm.trajectory import Trajectory
-from dfsm.types import Array
 
 ARM = two_link_robot_with_gravity(vary_mass=True)
 MASSES = (2.0, 3.0)  # kg
@@ -153,7 +153,7 @@ def problem(
 
 def training_runs(size: CodesignSize, seed: int) -> list[Trajectory]:
     """Half a second each, with every mass in turn, from random states under random torques."""
-    hold = torques(float(np.mean(MASSES)))
+    hold = holding_torques(ARM, MIDDLE, [sum(MASSES) / 2])
     return ARM.campaign(
         size.runs * size.masses,
         np.linspace(0, DURATION, 51),
@@ -178,13 +178,6 @@ def surrogate(runs: Sequence[Trajectory], corrective: CorrectiveChoice) -> DFSM:
                 nonlinear_only=False,
             ),
         ).model
-
-
-def torques(mass: float) -> Array:
-    """What holds the arm in the middle of its motion, in N m."""
-    point = (MIDDLE, np.zeros(2), np.zeros(0), np.array([mass]))
-    accelerations = np.asarray(ARM.f(*point))[[1, 3]]
-    return -np.linalg.solve(ARM.jacobians(*point)[1][[1, 3]], accelerations)
 
 
 def _miss(found: Solution) -> dict[str, float]:

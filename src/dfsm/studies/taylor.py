@@ -22,8 +22,9 @@ from dfsm.progress import track
 from dfsm.samples import FitSettings, extract, select
 from dfsm.settings import settings
 from dfsm.simulators import ODESystem, two_link_robot_with_gravity
+from dfsm.simulators.two_link_robot import holding_torques
 from dfsm.studies.assess import slope
-from dfsm.studies.extraction import DURATION, STATES, around, holding_torques
+from dfsm.studies.extraction import DURATION, STATES, around
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
 
@@ -133,7 +134,7 @@ def compare_with_taylor(size: TaylorSize, seed: int) -> TaylorComparison:
     truth, linear = robot.derivative(test), slope(fitted.model.linear_fit(), test)
     example = tuple(a[thin] for a in (test.time, truth, linear, _taylor(robot, test)))
     return TaylorComparison(
-        stationary=robot.eigenvalues(STATES, holding_torques(robot)).real,
+        stationary=robot.eigenvalues(STATES, holding_torques(robot, STATES)).real,
         unforced=robot.eigenvalues(STATES, (0.0, 0.0)).real,
         fits=tuple(fits),
         decisions=tuple(fitted.model.provenance.record["rows"]),
@@ -169,7 +170,7 @@ def _linear_fit(robot: ODESystem, train: Sequence[Trajectory], delta: float) -> 
 
 def _taylor(robot: ODESystem, run: Trajectory) -> Array:
     """First-order expansion about the stationary point along a run, shape ``(time, state)``."""
-    torques = holding_torques(robot)
+    torques = holding_torques(robot, STATES)
     A, B, *_ = robot.jacobians(STATES, torques)
     here = np.concatenate([STATES, torques])
     names = [c.name for c in (*robot.states, *robot.controls)]
