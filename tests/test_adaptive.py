@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import warnings
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -192,3 +194,27 @@ def test_mass_and_torques_on_a_small_surrogate():
     found = dfsm.solve(codesign.problem(model), METHOD)
     assert found.solved
     assert 2.0 <= found.parameters["m2"] <= 3.0
+
+
+def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
+    path = Path(__file__).parents[1] / "examples" / "robot_codesign.py"
+    spec = importlib.util.spec_from_file_location("robot_codesign", path)
+    assert spec is not None
+    assert spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    arm = codesign.CodesignSize(runs=4, masses=3, corrective=dfsm.GP(samples=40))
+    turn = adaptive_robot.AdaptiveSize(
+        runs=4,
+        corrective=dfsm.GP(samples=40),
+        options=dfsm.AdaptiveSettings(most_rounds=1, method=adaptive_robot.METHOD),
+    )
+    monkeypatch.setattr(codesign, "CodesignSize", lambda: arm)
+    monkeypatch.setattr(adaptive_robot, "AdaptiveSize", lambda: turn)
+    example.main(["--seed", "1"])
+    out = capsys.readouterr().out
+    assert "on a surrogate of 12 runs" in out
+    assert "truth: m2 = 2.4967 kg, cost 0.98313" in out
+    assert "from 4 runs:" in out
+    assert "round 1: predicted" in out
+    assert "truth: 5.23373" in out
