@@ -206,7 +206,7 @@ def braking_table(figures: Mapping[str, Any]) -> list[str]:
     """Effect of torque on the speed's derivative, true and as derivatives teach it."""
     lines = ["| torque's effect (10⁻⁵ rpm/s per kN m) | weakest | strongest |", "|---|---|---|"]
     for name, pair in figures["braking"].items():
-        cells = [f"{1e5 * v:.2g}".replace("-", "\N{MINUS SIGN}") for v in pair]
+        cells = [f"{1e5 * v:.1f}".replace("-", "\N{MINUS SIGN}") for v in pair]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
 

@@ -63,4 +63,4 @@ def test_tables_have_a_line_for_everything():
     (line,) = readme.field_table({"field": {"speed": shares}})[2:]
     assert line == "| speed | 5 % | 49 % | 13 % (95th percentile: 25 %) |"
     (line,) = readme.braking_table({"braking": {"LTI": [-5.1e-6, -3.85e-4]}})[2:]
-    assert line == "| LTI | −0.51 | −38 |"
+    assert line == "| LTI | −0.5 | −38.5 |"

@@ -21,12 +21,12 @@ import dfsm
 from dfsm.console import print_article
 from dfsm.report.publish import publish
 from dfsm.report.turbine_control import control_article
-from dfsm.studies.turbine_control import ControlStudy, Region, study
+from dfsm.studies.turbine_control import ControlStudy, ControlStudySize, Region, study
 
 # Winds (m/s, as in the file names) and the seeds to optimise for: two in the transition region,
 # one below and one above it.
 SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
-QUICK = {"12": range(9, 10)}
+QUICK, FEW = {"12": range(9, 10)}, ControlStudySize(pitch_limits=(5.0, 7.0))
 
 
 def regions(models: Path, series: Mapping[str, range]) -> list[Region]:
@@ -46,14 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> ControlStudy:
     parser = argparse.ArgumentParser(description="Optimal control on bundled OpenFAST runs.")
     parser.add_argument("--models", type=Path, default=Path("out"), help="folder of demo.py")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")
-    parser.add_argument("--quick", action="store_true", help="one series in the transition region")
+    parser.add_argument("--quick", action="store_true", help="one series, two limits")
     options = parser.parse_args(arguments)
-    series = QUICK if options.quick else SERIES
+    series, size = (QUICK, FEW) if options.quick else (SERIES, ControlStudySize())
     if not (options.models / "model_all_winds").is_dir():
         parser.error(f"{options.models} holds no models: run examples/iea15/demo.py first")
     with dfsm.show_progress(), warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)  # they stand in the tables
-        found = study(regions(options.models, series))
+        found = study(regions(options.models, series), size)
     article = control_article(found)
     written = publish(article, options.output)
     print_article(article)
