@@ -6,7 +6,7 @@ from typing import Any
 
 from dfsm.studies import adaptive_robot, codesign
 
-SEEDS = (0,)
+SEEDS = (0, 1, 2)
 
 
 def run() -> dict[str, Any]:

@@ -257,13 +257,17 @@ def adaptive_table(figures: Mapping[str, Any]) -> list[str]:
             str(found["runs"]),
             str(found["simulations"]) + ("" if found["status"] == "AGREED" else ", no agreement"),
             f"{found['predicted']:.4f}",
-            f"{found['realised']:.4f} + {found['price']:.4f}",
+            f"{found['realised']:.4f} {found['price']:+.4f}".replace("-", "\N{MINUS SIGN}"),
             f"{found['miss']:.1g}",
             f"{found['true_cost']:.4f}",
-            ", ".join("–" if d is None else f"{d:.2g} %" for d in rounds),
+            ", ".join("–" if d is None else _percent(d) for d in rounds),
         ]
         lines.append(f"| {seed} | {' | '.join(cells)} |")
     return lines
+
+
+def _percent(value: float) -> str:
+    return f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
 
 def known_table(figures: Mapping[str, Any]) -> list[str]:
