@@ -66,9 +66,10 @@ def test_without_a_schedule_it_is_mahalanobis_distance(runs):
     np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning")
 def test_new_runs_are_inside_as_often_as_the_quantile_says(model):
     shares = [simulate(model, controlled(100 + k)).outside for k in range(10)]
-    assert np.mean(shares) < 0.02
+    assert 0.005 < np.mean(shares) < 0.05  # 2 % are promised
 
 
 def test_combinations_that_never_occurred_are_outside(model):
@@ -145,6 +146,12 @@ def test_an_optimum_stays_near_the_data_if_asked(model):
     inputs = kept.trajectory.select(["u", "w", "q"]).values
     assert np.asarray(model.region.distance_chosen(inputs)).max() < 1 + 1e-6
     assert kept.objective > free.objective
+    # Solved twice, without the distance and with it; an optimum as the guess saves the first.
+    assert len(kept.meshes) == 2
+    method = DirectTranscription(mesh=20, refine=None, stay_inside=True)
+    again = solve(problem, method, free)
+    assert len(again.meshes) == 1
+    assert again.objective == pytest.approx(kept.objective, rel=1e-6)
 
 
 def test_a_single_run_is_judged_by_its_quarters(runs):

@@ -16,8 +16,9 @@ import numpy as np
 from dfsm.schedule import hats
 from dfsm.types import Array, IntArray
 
-# The distance that this share of a run's samples keeps, measured by the data of the other runs.
-_SHARE = 0.999
+# Share of the samples that are nearer than is said to be usual, measured by the other runs. Few are
+# left out: a run that went where no other did must not make everything usual.
+_SHARE = 0.98
 # Standard deviations of any direction are at least this share of an input's overall one.
 _FLOOR = 1e-2
 
@@ -43,7 +44,7 @@ def whiten(
     Returns
     -------
     tuple
-        Matrices W, shape ``(point, input, input)``, and how far runs usually go. The distance
+        Matrices W, shape ``(point, input, input)``, and the largest usual distance. The distance
         of I at an operating point with mean μ is |W (I − μ)|; its first components depend on the
         columns in `first` alone.
     """
@@ -65,9 +66,8 @@ def whiten(
         middles = used[:, 0, 1:] / used[:, :1, 0]
         shares = hats(jnp.asarray(grid), jnp.asarray(z[mine, schedule or 0]))
         given = map(jnp.asarray, (z[mine], shares, middles, W))
-        found.append(np.quantile(np.sqrt(squared_distance(*given)), _SHARE))
-    # Of the middle run: one that went where no other did must not make everything usual.
-    reach = float(np.median(found))
+        found.append(np.sqrt(squared_distance(*given)))
+    reach = float(np.quantile(np.concatenate(found), _SHARE))
     return np.stack([_whitening(s, order) for s in total]) / std, reach
 
 

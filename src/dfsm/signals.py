@@ -260,8 +260,7 @@ class Region(eqx.Module):
         """Squared distance of ``(..., input)`` from the training data: 1 is as far as is usual.
 
         Mahalanobis's, Σ_k h_k |W_k (I − μ_k)|² over the operating points k with hat functions h of
-        the schedule. Half of the training runs have 99.9 % of their samples nearer, measured by
-        the other runs.
+        the schedule. 98 % of the training samples are nearer, measured by the other runs.
         """
         return self._squared(jnp.asarray(inputs), slice(None))
 
