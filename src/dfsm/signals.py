@@ -248,7 +248,8 @@ class Region(eqx.Module):
         Either an input is outside its range, or all together are farther from what occurred
         together than samples of a new run usually are.
         """
-        return jnp.any(self.beyond(inputs), axis=-1) | (self.distance(inputs) > 1)
+        # An optimum that is kept inside meets the limit to a solver's tolerance.
+        return jnp.any(self.beyond(inputs), axis=-1) | (self.distance(inputs) > 1 + 1e-6)
 
     def beyond(self, inputs: ArrayLike) -> jax.Array:
         """Tell which of ``(..., input)`` are outside their own training range."""
