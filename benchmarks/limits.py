@@ -17,15 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 import dfsm
 from benchmarks.accuracy import demo
-from benchmarks.rollouts import errors
-from dfsm.integrate import exogenous_groups
-from dfsm.latents import as_states, poles
+from benchmarks.rollouts import errors, low_passed, uncorrected
 from dfsm.rollout_error import record_of
 from dfsm.types import Array
 
@@ -65,16 +61,11 @@ def run() -> dict[str, Any]:
         return {"variants": found, "field": field, "braking": braking(turbine)}
 
 
-def plain(turbine: Any) -> dfsm.FitSettings:
-    """The demo's, without outputs."""
-    return replace(turbine.refined_settings(), corrective=dfsm.NoCorrection(), outputs=())
-
-
 def variants(
     turbine: Any,
 ) -> Iterator[tuple[str, Runs, dfsm.FitSettings, dfsm.RefineSettings]]:
     """Name, training runs, and how to fit and refine."""
-    winds, full, refinement = turbine.WINDS["all winds"], plain(turbine), turbine.REFINEMENT
+    winds, full, refinement = turbine.WINDS["all winds"], uncorrected(turbine), turbine.REFINEMENT
     perturbed = turbine.perturbed(testing=False)
     every = [*turbine.runs(winds, range(1, 9)), *perturbed]
     for seeds in SEEDS:
@@ -98,7 +89,7 @@ def with_thrust(runs: Runs) -> list[dfsm.Trajectory]:
 
 def braking(turbine: Any) -> dict[str, list[float]]:
     """Torque's effect on the speed's derivative (rpm/s per kN m), smallest and largest over w."""
-    full = plain(turbine)
+    full = uncorrected(turbine)
     runs = turbine.runs(turbine.WINDS["all winds"], range(1, 9))
     free = replace(full.linear, known={})
     known = turbine.BRAKING["GenSpeed"]["GenTq"]
@@ -123,18 +114,11 @@ def field_shares(model: dfsm.DFSM, runs: Runs) -> dict[str, Any]:
     and the rest of the field shifted in time, which has nothing to do with the run.
     """
     field = dfsm.read(DATA / "field.parquet")
-    run = next(r for r in runs if r.name == "iea15_2dof_12mps_s08")
+    run = next(r for r in runs if r.name == field.name)
     record = record_of(model, run, 0.5, demo().START, None)
-    latent = jnp.asarray(record.follow(poles(model))[record.before :])
-    states = np.concatenate([record.states, as_states(latent)], axis=1)
-    inputs = record.inputs[2 * record.before :: 2]
-    groups = exogenous_groups(model, jnp.asarray(inputs))
-    left = (
-        record.slopes - np.asarray(model.derivative(states, *groups))[:, : record.slopes.shape[1]]
-    )
+    inputs, left = record.inputs[2 * record.before :: 2], record.left_over(model)
     time = demo().START + record.step * np.arange(len(left))
-    low = butter(4, CUTOFF, fs=1 / record.step, output="sos")
-    slow = lambda a: sosfiltfilt(low, a - a.mean(axis=0), axis=0)  # noqa: E731
+    slow = lambda a: low_passed(a - a.mean(axis=0), record.step, CUTOFF)  # noqa: E731
     names = model.signals.exogenous
     three = slow(inputs[:, [names.index(n) for n in ("RotWind", "RotShearV", "RotShearH")]])
     rest = slow(field.resample(time).values)

@@ -90,7 +90,7 @@ def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
         begin = time.perf_counter()
         models = [dfsm.fit(turbine.runs([w], range(1, 9)), choices).model for w in winds]
         yield name, models, time.perf_counter() - begin
-    known = replace(full, corrective=dfsm.NoCorrection(), outputs=())
+    known = uncorrected(turbine)
     plain = replace(known, linear=replace(known.linear, known={}))
     average = replace(plain, disturbances=("RotWind", "Wave1Elev"), features=())
     refinement = turbine.REFINEMENT
@@ -112,6 +112,11 @@ def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
     ):
         begin = time.perf_counter()
         yield name, [dfsm.fit(runs, choices, refine).model], time.perf_counter() - begin
+
+
+def uncorrected(turbine: Any) -> dfsm.FitSettings:
+    """The demo's settings without outputs, which have no part in a rollout of the states."""
+    return replace(turbine.refined_settings(), corrective=dfsm.NoCorrection(), outputs=())
 
 
 def leak(turbine: Any) -> dict[str, Any]:
@@ -178,8 +183,12 @@ def _recorded(run: dfsm.Trajectory) -> Array:
 def _low_passed(run: dfsm.Trajectory, values: Array) -> Array:
     if run.time_step is None:
         raise ValueError("a filter needs an equidistant mesh")
-    sos = butter(4, CUTOFF, fs=1 / run.time_step, output="sos")
-    return sosfiltfilt(sos, values, axis=0)
+    return low_passed(values, run.time_step, CUTOFF)
+
+
+def low_passed(values: Array, step: float, cutoff: float) -> Array:
+    """Signals ``(time, signal)`` every `step` s below a frequency in Hz, without phase."""
+    return sosfiltfilt(butter(4, cutoff, fs=1 / step, output="sos"), values, axis=0)
 
 
 def _nrmse(found: Array, truth: Array) -> Array:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import warnings
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dfsm
+from conftest import example_module
 from dfsm.control import Agreement, DirectTranscription, realised
 from dfsm.studies import adaptive_robot, codesign
 
@@ -197,12 +196,7 @@ def test_mass_and_torques_on_a_small_surrogate():
 
 
 def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
-    path = Path(__file__).parents[1] / "examples" / "robot_codesign.py"
-    spec = importlib.util.spec_from_file_location("robot_codesign", path)
-    assert spec is not None
-    assert spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
+    example = example_module("robot_codesign")
     arm = codesign.CodesignSize(runs=4, masses=3, corrective=dfsm.GP(samples=40))
     turn = adaptive_robot.AdaptiveSize(
         runs=4,

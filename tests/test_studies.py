@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from dataclasses import replace
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import Dfsm
+from conftest import Dfsm, example_module
 from dfsm.corrective import RBF
 from dfsm.fit import fit
 from dfsm.report import publish as publishing
@@ -26,7 +25,7 @@ from dfsm.studies.defaults import PEER
 from dfsm.studies.multi_fidelity import LINEAR, MULTI, NONLINEAR, choices, draw
 from dfsm.studies.two_link_robot import RobotStudy
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "two_link_robot.py"
+PAGE = Path(__file__).parents[1] / "docs" / "two-link-robot.md"
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +36,7 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def quick(output: Path) -> RobotStudy:
     """The study as the example runs it, in quick mode."""
-    spec = importlib.util.spec_from_file_location("example_two_link_robot", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main(["--quick", "--output", str(output)])
+    return example_module("two_link_robot").main(["--quick", "--output", str(output)])
 
 
 # -- the paper's claims, and ours ---------------------------------------------------------------
@@ -91,7 +85,7 @@ def test_a_correction_helps_and_leaves_linear_rows_alone(quick):
 
 
 def test_the_documentation_states_the_sweep(quick):
-    text = (EXAMPLE.parents[1] / "docs" / "two-link-robot.md").read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
     block = text.split("<!-- sweep -->")[1].split("<!-- end -->")[0]
     stated = {row.split(" | ")[0].strip("| "): row.split(" | ")[4:] for row in block.splitlines()}
     sweep = quick.multi_fidelity.sweep

@@ -25,7 +25,7 @@ import numpy as np
 
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
 from dfsm.errors import DfsmError, DfsmWarning, near_matches
-from dfsm.latents import as_states, poles, with_latent_range
+from dfsm.latents import with_latent_range
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.progress import track
@@ -207,10 +207,7 @@ def refine(
             best, after = at, error
     refined = parameters.at(jnp.asarray(best))
     if refined.signals.latents:
-        paths = [
-            np.asarray(as_states(jnp.asarray(r.follow(poles(refined)))))[r.before :] for r in train
-        ]
-        refined = with_latent_range(refined, paths)
+        refined = with_latent_range(refined, [r.latent_states(refined) for r in train])
     names = {"training": [r.name for r in training], "validation": [r.name for r in validation]}
     return _result(model, refined, (before, after), history, names)
 

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.corrective.functions import Perceptron
-from dfsm.integrate import exogenous_groups
 from dfsm.latents import Poles, add_latents, as_states
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
@@ -58,7 +57,7 @@ def start_latents(
     longest = max((len(r.states) - 1) * r.step for r in records)
     decay = np.geomspace(_SLOWEST / longest, 1 / (_FASTEST * records[0].step), pairs)
     rows = list(Parametrisation.of(model, spread).rows)
-    left = np.concatenate([_left_over(model, r)[:, rows] / spread[rows] for r in records])
+    left = np.concatenate([r.left_over(model)[:, rows] / spread[rows] for r in records])
 
     std = np.asarray(region.scale)[:n_uw]
     names = [c.name for c in s.inputs[:n_uw]]
@@ -121,12 +120,6 @@ def _poles(decay: Array, drive: Array, middle: Array) -> Poles:
     """Poles at 45 degrees, at rest under the mean inputs."""
     b = jnp.asarray(drive, dtype=complex)
     return Poles(jnp.asarray(decay), jnp.asarray(decay), b, -b @ middle)
-
-
-def _left_over(model: DFSM, record: Record) -> Array:
-    """Recorded minus modelled derivatives at the ends of steps."""
-    exogenous = exogenous_groups(model, jnp.asarray(record.inputs[2 * record.before :: 2]))
-    return record.slopes - np.asarray(model.derivative(record.states, *exogenous))
 
 
 def _regress(paths: Array, targets: Array) -> Array:

@@ -72,6 +72,18 @@ class Record:
         v = jnp.asarray(self.inputs[::2, : len(self.rest)])
         return np.asarray(evolve(found, h, v, jnp.asarray(self.rest)))
 
+    def latent_states(self, model: DFSM) -> Array:
+        """A model's latent states from the first state on, ``(step + 1, latent)``."""
+        pairs = self.follow(poles(model))[self.before :]
+        return np.asarray(as_states(jnp.asarray(pairs)))
+
+    def left_over(self, model: DFSM) -> Array:
+        """Recorded minus modelled derivatives of the observed states, ``(step + 1, state)``."""
+        states = np.concatenate([self.states, self.latent_states(model)], axis=1)
+        exogenous = exogenous_groups(model, jnp.asarray(self.inputs[2 * self.before :: 2]))
+        modelled = np.asarray(model.derivative(states, *exogenous))
+        return self.slopes - modelled[:, : self.slopes.shape[1]]
+
 
 def record_of(
     model: DFSM, run: Trajectory, step: float, start: float | None, stop: float | None

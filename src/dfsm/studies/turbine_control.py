@@ -391,12 +391,13 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
     for region in regions:
         own = turbine_case(region)
         for wind in region.tests:
-            for case in (PAPER, own):
-                found = [optimise(region, wind, case, p, size) for p in size.pitch_limits]
-                results += found
-            left = any((r.solution.outside or 0.0) > _LEAVES for r in found)
-            if size.inside and left:
-                results += [optimise(region, wind, own, r.most_pitch, size, r) for r in found]
+            paper, free = (
+                [optimise(region, wind, case, p, size) for p in size.pitch_limits]
+                for case in (PAPER, own)
+            )
+            results += [*paper, *free]
+            if size.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
+                results += [optimise(region, wind, own, r.most_pitch, size, r) for r in free]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
