@@ -211,15 +211,20 @@ def test_slopes_written_out_are_those_of_the_model(model, kind):
         slopes = jax.jacfwd(lambda t, x=x, u=u, w=w, p=p: parameters.at(t).derivative(x, u, w, p))
         there = parameters.at(at)
         found = np.zeros((3, parameters.size))
-        found[:1] = parameters.slopes(at, there, point)
+        weight = rng.normal()
+        found[:1] = (
+            parameters.slopes(at, there, point[None, None], jnp.full((1, 1, 1, 1), weight))[0]
+            / weight
+        )
         found[1:, parameters.latent_columns[0]] = parameters.latent_slopes(there, point)[0]
         np.testing.assert_allclose(found, slopes(at), rtol=1e-9, atol=1e-12)
 
 
-def test_sensitivities_agree_with_differences(model, runs):
+@pytest.mark.parametrize("length", [5.0, None])  # less than a block of steps, and some and a rest
+def test_sensitivities_agree_with_differences(model, runs, length):
     record = record_of(model, runs[0], 0.2, START, 40.0)
     parameters = Parametrisation.of(model, np.array([0.7]))
-    problem = RolloutError(parameters, [record], 5.0, np.ones(1))
+    problem = RolloutError(parameters, [record], length, np.ones(1))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)
     eps, slopes = 1e-6, []

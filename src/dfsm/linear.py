@@ -107,6 +107,11 @@ class LinearModel(eqx.Module):
     schedule: int | None = eqx.field(static=True)
     known: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
+    @property
+    def known_inputs(self) -> tuple[int, ...]:
+        """Columns of the inputs with a coefficient that was given."""
+        return tuple(sorted({column for _, column in self.known}))
+
     def at(self, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
         """Return L, shape ``(target, input)``, and b, shape ``(target,)``, at a schedule value.
 

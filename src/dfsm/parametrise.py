@@ -59,7 +59,7 @@ class Parametrisation(eqx.Module):
         rows = tuple(i for i in range(len(s.observed)) if i not in known)
         L = np.asarray(model.f.coefficients)[:, list(rows)]
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
-        varies[[column for _, column in model.f.known]] = False
+        varies[list(model.f.known_inputs)] = False
         # Nothing is known yet about states that have only been added.
         varies[s.observed_columns.stop :] |= np.array(
             [c in s.latents for c in (*s.latents, *s.parameters)], dtype=bool
@@ -116,8 +116,10 @@ class Parametrisation(eqx.Module):
         )
         return self._latents(model, dynamics, drive) if self.model.signals.latents else model
 
-    def slopes(self, deviations: jax.Array, model: DFSM, inputs: jax.Array) -> jax.Array:
-        """∂f̂/∂θ of the observed states at one input vector, ``(observed state, parameter)``.
+    def slopes(
+        self, deviations: jax.Array, model: DFSM, inputs: jax.Array, weights: jax.Array
+    ) -> jax.Array:
+        """Σ_i W_i ∂f̂/∂θ(I_i) of the observed states, but for the dynamics of latent pairs.
 
         Written out because it is what refinement spends its time on; tracing `at` backwards gives
         the same several times slower.
@@ -129,32 +131,58 @@ class Parametrisation(eqx.Module):
         model
             What `at` makes of them.
         inputs
-            I, shape ``(input,)``.
+            I, shape ``(step, i, input)``.
+        weights
+            W, shape ``(step, i, observed state, observed state)``.
+
+        Returns
+        -------
+        Array
+            Shape ``(step, observed state, parameter)``; zero for the latent pairs' own.
         """
-        observed, z = len(self.model.signals.observed), self._standardised(inputs)
-        line = jnp.zeros((observed, len(self.rows)))
-        line = line.at[list(self.rows), np.arange(len(self.rows))].set(self.spread)
-        hats = model.f.shares(inputs)
-        moved = jnp.concatenate([z[np.array(self.scheduled, dtype=int)], jnp.ones(1)])
-        parts = [
-            jnp.einsum("sr,k,j->skrj", line, hats, moved),
-            jnp.einsum("sr,j,rj->srj", line, z[self._constant_columns], self._free),
-            jnp.zeros((observed, self.latent_columns.size)),
-        ]
+        steps, stages, observed = weights.shape[:3]
+        z, hats = self._standardised(inputs), jax.vmap(jax.vmap(model.f.shares))(inputs)
+        by_row = weights[..., list(self.rows)] * self.spread
+        ones = jnp.ones((steps, stages, 1))
+        moved = jnp.concatenate([z[..., np.array(self.scheduled, dtype=int)], ones], axis=2)
+        constant = z[..., self._constant_columns]
+
+        # Sums of products written so that each becomes one pass over its result.
+        scheduled = sum(
+            hats[:, i, None, :, None, None]
+            * by_row[:, i, :, None, :, None]
+            * moved[:, i, None, None, None]
+            for i in range(stages)
+        )
+        always = sum(by_row[:, i, ..., None] * constant[:, i, None, None] for i in range(stages))
+        parts = [scheduled, always * self._free]
+        parts = [jnp.reshape(p, (steps, observed, -1)) for p in parts]
+        parts.append(jnp.zeros((steps, observed, self.latent_columns.size)))
         if self._corrective_shapes:
-            corrective = self._parts(deviations)[4:]
+            corrected = weights[..., list(self.model.corrected)]
+            by_part = self._corrective_slopes(deviations, inputs)
+            parts += [jnp.einsum("tiar,tirp->tap", corrected, by_part)]
+        return jnp.concatenate(parts, axis=2)
+
+    def _corrective_slopes(self, deviations: jax.Array, inputs: jax.Array) -> jax.Array:
+        """∂e/∂θ, shape ``(step, i, corrected row, corrective parameter)``."""
+        corrective, rows = self._parts(deviations)[4:], len(self.model.corrected)
+
+        def at_one(inputs: jax.Array) -> jax.Array:
             by_part = jax.jacrev(lambda parts: self._correction(parts, inputs))(corrective)
-            rows = np.eye(observed)[:, list(self.model.corrected)]
-            parts += [rows @ p.reshape(len(self.model.corrected), -1) for p in by_part]
-        return jnp.concatenate([p.reshape(observed, -1) for p in parts], axis=1)
+            return jnp.concatenate([p.reshape(rows, -1) for p in by_part], axis=1)
+
+        return jax.vmap(jax.vmap(at_one))(inputs)
 
     def latent_slopes(self, model: DFSM, inputs: jax.Array) -> jax.Array:
         """∂f̂/∂θ of each latent pair and its own parameters, ``(pair, 2, own)``.
 
         Parameters
         ----------
-        model, inputs
-            As for `slopes`.
+        model
+            What `at` makes of some deviations.
+        inputs
+            I, shape ``(input,)``.
         """
         s, now, start = self.model.signals, poles(model), poles(self.model)
         z = self._standardised(inputs)

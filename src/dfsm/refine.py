@@ -22,6 +22,7 @@ from itertools import islice
 
 import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
 from dfsm.errors import DfsmError, DfsmWarning, near_matches
@@ -127,6 +128,8 @@ class RefineResult:
     message: str
 
 
+# One thread for each product of matrices: several runs are at work already.
+@threadpool_limits.wrap(limits=1)
 def refine(
     model: DFSM,
     runs: Iterable[Trajectory],
