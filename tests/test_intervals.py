@@ -16,7 +16,6 @@ from dfsm.fit import fit
 from dfsm.intervals import load_intervals
 from dfsm.linear import LPV, LTI
 from dfsm.samples import FitSettings
-from dfsm.signals import Provenance
 from dfsm.simulate import simulate
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.validate import validate
@@ -137,13 +136,6 @@ def test_runs_that_are_not_new_are_told(model, intervals):
     notes = validate(model, [run(101), run(300)], intervals=found).warnings
     assert "1 of the 2 test runs calibrated the intervals (run101)" in notes[0]
     assert notes[1] == f"intervals: {told}"
-    groups = {"training": [f"run{k}" for k in range(1, 8)], "validation": ["run0"]}
-    record = {**model.provenance.record, "refinement": groups}
-    refined = replace(model, provenance=Provenance(record))
-    (told,) = calibrate(refined, [run(0), run(100), run(101)]).warnings
-    assert "1 of the 3 calibration runs were held out by the refinement" in told
-    # To a test they are training runs, as before.
-    assert "used in training (run0)" in validate(refined, [run(0)]).warnings[0]
     assert intervals.warnings == ()
 
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lsim
 
 from dfsm.control import DirectTranscription, OptimalControlProblem, solve
-from dfsm.corrective import RBF, GaussianUnits, NoCorrection, Perceptron
+from dfsm.corrective import GP, MLP, RBF, GaussianUnits, NoCorrection, Perceptron
 from dfsm.derivatives import StateSpec
 from dfsm.errors import DfsmError
 from dfsm.fit import fit
@@ -25,7 +25,7 @@ from dfsm.simulate import Status, initial_state, simulate
 from dfsm.storage import load, load_all, save
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.validate import compared, validate
-from systems import wander
+from systems import DUFFING, wander
 
 TIME = np.arange(0, 60.01, 0.1)
 START = 20.0
@@ -290,6 +290,42 @@ def test_the_others_are_fitted_to_what_known_coefficients_leave():
     rest = np.linalg.lstsq(X[:, 1:], targets[:, 1] - 0.7 * inputs[:, 0], rcond=None)[0]
     np.testing.assert_allclose(L[0], free[:3], rtol=1e-9)
     np.testing.assert_allclose(L[1], [0.7, *rest[:2]], rtol=1e-9)
+
+
+def test_a_network_from_rollouts_does_not_change_known_coefficients(runs):
+    choices = replace(SETTINGS, linear=LPV(schedule="w", points=3, known={"q": {"u": 0.125}}))
+    brief = replace(REFINEMENT, windows=(5.0,), iterations=3, network=4)
+    found = fit(runs, choices, brief)
+    assert found.model.e is not None
+    assert_effect(found.model, 0.125)
+
+
+@pytest.mark.parametrize("kind", [RBF(samples=20), GP(samples=20), MLP(hidden=(4,), iterations=20)])
+def test_a_correction_does_not_change_known_coefficients(kind):
+    # The effect of u that is given is wrong, and nothing is to make up for it.
+    bent = DUFFING.many(6, [(0, 3), (0, 2)], np.arange(0, 30.01, 0.05), spread=0.8)
+    states = (StateSpec(name="q", order=2),)
+    choices = FitSettings(
+        states=states,
+        controls=("u",),
+        disturbances=("w",),
+        corrective=kind,
+        linear=LTI(known={"q": {"u": 2.0}}),
+        nonlinear_only=False,
+    )
+    model = fit(bent, choices).model
+    assert model.e is not None
+    assert_effect(model, 2.0)
+
+
+def assert_effect(model, expected):
+    """The last observed state's derivative changes with u by so much everywhere."""
+    rng = np.random.default_rng(0)
+    row = len(model.signals.observed) - 1
+    low, high = np.asarray(model.region.low), np.asarray(model.region.high)
+    for point in rng.uniform(low, high, (20, len(low))):
+        B = model.jacobians(*model.split(point))[1]
+        assert B[row, 0] == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize(

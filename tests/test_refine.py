@@ -86,9 +86,21 @@ def test_a_biased_fit_is_mended(runs, biased):
 
 def test_training_errors_fall_within_a_stage(runs, biased):
     history = refine(biased, runs, CHOICES).history
-    for stage in range(2):
+    for stage in range(3):
         errors = [entry["training"] for entry in history if entry["stage"] == stage]
         assert (np.diff(errors) <= 0).all()
+
+
+def test_the_runs_held_out_train_at_last(runs, biased):
+    result = refine(biased, runs, CHOICES)
+    stages = [entry["stage"] for entry in result.history]
+    assert 0 < stages.count(2) <= stages.count(1)
+    assert all(("validation" in entry) == (entry["stage"] < 2) for entry in result.history)
+    records = [record_of(biased, run, CHOICES.step, None, None) for run in runs]
+    parameters = Parametrisation.of(result.model, np.ones(2))
+    everything = RolloutError(parameters, records, None, np.ones(2))
+    error = everything.relative(np.zeros(parameters.size))
+    assert result.history[-1]["training"] == pytest.approx(error, rel=1e-9)
 
 
 def test_the_true_model_is_not_made_worse():

@@ -34,7 +34,7 @@ BRAKING = {"GenSpeed": {"GenTq": -2.997e-5}}
 REFINEMENT = dfsm.RefineSettings(
     windows=(20.0, None),
     step=0.5,
-    iterations=14,
+    iterations=15,
     latents=8,
     latent_inputs=(
         *("BldPitch1", "RotWind", "RotShearV", "RotShearH"),

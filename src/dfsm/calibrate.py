@@ -20,7 +20,7 @@ from dfsm.signals import with_computed
 from dfsm.simulate import SimulationSettings, Status
 from dfsm.trajectory import Dataset, Trajectory
 from dfsm.types import Array
-from dfsm.validate import listed, parts_in_fit, validate
+from dfsm.validate import listed, of_the_fit, validate
 
 # Calibration runs below which a quantile over runs means nothing.
 _FEWEST = 3
@@ -100,23 +100,13 @@ def calibrate(
 
 def _leaks(model: DFSM, runs: Sequence[Trajectory]) -> list[str]:
     """Calibration runs that were in the training data."""
-    parts, found = parts_in_fit(model, runs), []
-    fitted, held = (
-        [r.where for r, part in zip(runs, parts, strict=True) if part == which]
-        for which in ("fitted", "held out")
-    )
-    if fitted:
-        found.append(
-            f"{len(fitted)} of the {len(runs)} calibration runs were used in training "
-            f"({listed(fitted)}): new runs will lie inside less often than promised"
-        )
-    if held:
-        found.append(
-            f"{len(held)} of the {len(runs)} calibration runs were held out by the refinement to "
-            f"decide when to stop ({listed(held)}): the fit before it and the outputs know them, "
-            "so intervals may be a little narrow"
-        )
-    return found
+    fitted = of_the_fit(model, runs)
+    if not fitted:
+        return []
+    return [
+        f"{len(fitted)} of the {len(runs)} calibration runs were used in training "
+        f"({listed(fitted)}): new runs will lie inside less often than promised"
+    ]
 
 
 def _sums(grid: Array, schedule: Array, squares: Array) -> tuple[Array, Array]:

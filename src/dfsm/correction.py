@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.corrective import Corrective, NoCorrection, fit_corrective
+from dfsm.corrective import Corrective, NoCorrection, fit_corrective, ignoring
 from dfsm.derivatives import kinematic_rows
 from dfsm.latents import at_rest
 from dfsm.linear import LinearFit, LinearModel
@@ -82,13 +82,17 @@ def correct(
     large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > choices.gate]
     function, explained, detail = None, dict[int, float](), ""
     if large and not isinstance(choices.corrective, NoCorrection):
+        hidden, seen = list(linear.model.known_inputs), inputs
+        if hidden:
+            seen = inputs.copy()
+            seen[:, hidden] = inputs[:, hidden].mean(axis=0)
         trained = fit_corrective(
-            inputs, residuals[:, large], samples.runs, choices.corrective, choices.seed
+            seen, residuals[:, large], samples.runs, choices.corrective, choices.seed
         )
         explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
         # A correction that does no good on runs left out of training would only do harm.
         kept = [k for k, share in enumerate(trained.explained) if share > _WORTHWHILE]
-        function = trained.function.select(kept) if kept else None
+        function = ignoring(trained.function.select(kept), hidden) if kept else None
         large = [large[k] for k in kept]
     else:
         large = []

@@ -83,6 +83,7 @@ def _rows(model: DFSM) -> tuple[int, IntArray, IntArray]:
     return len(s.driving), np.arange(first, last, 2), np.arange(first + 1, last, 2)
 
 
+@jax.jit
 def evolve(found: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Array:
     """Follow the latent pairs along inputs that vary linearly within each step.
 
@@ -126,9 +127,6 @@ def as_states(pairs: jax.Array) -> jax.Array:
     return both.reshape(*pairs.shape[:-1], -1)
 
 
-_evolve = jax.jit(evolve)
-
-
 def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
     """Input vectors ``(..., input)`` with the latent states that their own inputs lead to."""
     s = model.signals
@@ -167,7 +165,7 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     h = np.zeros(padded)
     h[: len(run) - 1] = np.diff(run.time)
     v = np.concatenate([inputs.values, np.repeat(inputs.values[-1:], padded + 1 - len(run), 0)])
-    path = as_states(_evolve(poles(model), h, v, rest(run.time, inputs.values)))
+    path = as_states(evolve(poles(model), h, v, rest(run.time, inputs.values)))
     return np.asarray(path)[: len(run)]
 
 

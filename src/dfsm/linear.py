@@ -45,7 +45,8 @@ class LTI:
     known
         Coefficients that physics gives, by state and by control or disturbance, in the units of
         the channels: ``{"GenSpeed": {"GenTq": -2.997e-5}}`` says that 1 kN m slows the rotor by
-        2.997e-5 rpm/s. They enter the highest derivative of the state and are never changed.
+        2.997e-5 rpm/s. They enter the highest derivative of the state and are never changed; what
+        corrects the derivatives does not see these inputs.
     """
 
     kind: Literal["LTI"] = "LTI"

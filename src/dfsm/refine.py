@@ -9,14 +9,15 @@ training runs follow the record,
 
 with exact forward sensitivities through the integrator and Levenberg-Marquardt. Windows grow stage
 by stage: over short ones a poor start does no harm, over long ones slow errors show. Runs held out
-of the training decide when to stop, and a model that is no better on them is not handed out.
+of the training decide when to stop, and a model that is no better on them is not handed out. Then
+they are learnt from, too: as many steps as the last stage took follow on all runs.
 """
 
 from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -67,7 +68,7 @@ class RefineSettings:
         Weight of the squared deviations from the start, in which a unit changes a derivative by
         about its own spread, beside the sum of squared errors relative to their spread.
     hold_out
-        Share of the runs that only decide when to stop, at least one.
+        Share of the runs that decide when to stop, at least one; last of all they train, too.
     weights
         Weight of a state's squared error, by name; 1 where nothing is given.
     seconds
@@ -113,9 +114,10 @@ class RefineResult:
         Whether it is the refined one.
     before, after
         Mean squared error of the validation rollouts relative to each state's variance, over
-        the last of the windows; `after` is that of the best refined model.
+        the last of the windows; `after` is that of the best refined model before it saw them.
     history
-        One entry per step: stage, training and validation error.
+        One entry per step: stage, training and validation error; of the steps on all runs, which
+        come last, the training error alone.
     message
         The outcome in one sentence.
     """
@@ -154,12 +156,12 @@ def refine(
     start, stop
         Time window in s, as in the fit.
     seed
-        Decides which runs are held out.
+        Decides which runs are held out at first.
 
     Returns
     -------
     RefineResult
-        A refined model is never worse on the runs held out than its start, and stable at all
+        A refined model is not worse on the runs held out than its start, and stable at all
         schedule values if its start is.
 
     Raises
@@ -208,6 +210,12 @@ def refine(
         error = final.relative(at)
         if error < after:
             best, after = at, error
+    if after < before and not late():
+        length, stage = choices.windows[-1], len(choices.windows)
+        count = sum(entry["stage"] == stage - 1 for entry in history)
+        problem = RolloutError(parameters, [*train, *held], length, weights, choices.decay, kept)
+        best, found = _on_all(problem, best, count, late)
+        history += [{"stage": stage, **entry} for entry in found]
     refined = parameters.at(jnp.asarray(best))
     if refined.signals.latents:
         refined = with_latent_range(refined, [r.latent_states(refined) for r in train])
@@ -248,13 +256,9 @@ def _stage(
     late: Callable[[], bool],
 ) -> tuple[Array, list[dict[str, float]]]:
     """Step until the validation windows no longer improve; the best weights and the history."""
-    if not np.isfinite(problem.cost(start)):
-        return start, []
-    curvature = np.trace(problem.normal_equations(start)[0]) / len(start)
     best, error, taken = start, check.relative(start), 0
     history: list[dict[str, float]] = []
-    steps = levenberg_marquardt(problem, Step(start, _DAMPING * curvature), 0.0)
-    for count, step in enumerate(track(islice(steps, limit), "refining", limit), start=1):
+    for count, step in enumerate(_steps(problem, start, limit), start=1):
         now = check.relative(step.weights)
         history.append({"training": problem.relative(step.weights), "validation": now})
         if now < error:
@@ -262,6 +266,28 @@ def _stage(
         if count - taken >= _PATIENCE or late():
             break
     return best, history
+
+
+def _on_all(
+    problem: RolloutError, start: Array, count: int, late: Callable[[], bool]
+) -> tuple[Array, list[dict[str, float]]]:
+    """Step so many times; the last weights and the history."""
+    at, history = start, []
+    for step in _steps(problem, start, count):
+        at = step.weights
+        history.append({"training": problem.relative(at)})
+        if late():
+            break
+    return at, history
+
+
+def _steps(problem: RolloutError, start: Array, limit: int) -> Iterator[Step]:
+    """At most so many steps, none from where a rollout is not finite."""
+    if not np.isfinite(problem.cost(start)):
+        return
+    curvature = np.trace(problem.normal_equations(start)[0]) / len(start)
+    steps = levenberg_marquardt(problem, Step(start, _DAMPING * curvature), 0.0)
+    yield from track(islice(steps, limit), "refining", limit)
 
 
 def _result(
@@ -277,7 +303,8 @@ def _result(
     if improved:
         message = (
             f"refined on {len(names['training'])} runs: the error of rollouts over those held out "
-            f"({', '.join(names['validation'])}) went from {figures} standard deviations"
+            f"({', '.join(names['validation'])}) went from {figures} standard deviations; some "
+            "steps on all runs followed"
         )
         record = dict(model.provenance.record)
         record["refinement"] = {**names, "before": before, "after": after, "message": message}

@@ -13,7 +13,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.corrective.functions import Perceptron
+from dfsm.corrective.functions import Perceptron, ignoring
 from dfsm.latents import Poles, add_latents, as_states
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
@@ -102,7 +102,7 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
     Returns
     -------
     DFSM
-        Predicts what it did before.
+        Predicts what it did before. Inputs whose effect physics gave are hidden from the network.
     """
     rows = Parametrisation.of(model, spread).rows
     rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
@@ -113,7 +113,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
-    return replace(model, e=network, corrected=rows)
+    function = ignoring(network, model.f.known_inputs)
+    return replace(model, e=function, corrected=rows)
 
 
 def _poles(decay: Array, drive: Array, middle: Array) -> Poles:

@@ -7,7 +7,6 @@ the start of the window. States and outputs are then compared along the model's 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -287,21 +286,11 @@ def _histogram(runs: Sequence[RunComparison], channel: str, models: Sequence[str
     return Histogram(edges, counts)
 
 
-def parts_in_fit(
-    model: DFSM, runs: Sequence[Trajectory]
-) -> list[Literal["fitted", "held out"] | None]:
-    """What each run was to the fit; held out by the refinement counts where nothing else does."""
+def of_the_fit(model: DFSM, runs: Sequence[Trajectory]) -> list[str]:
+    """Where the runs come from that the fit or the refinement knows."""
     record = model.provenance.record
-    names, groups = record.get("channels", []), record.get("refinement", {})
-    # A name that stands in both groups is of two runs, which the record cannot tell apart.
-    spared = {*groups.get("validation", ())} - {*groups.get("training", ())}
-    trained = {d["sha256"]: d["name"] for d in record.get("data", [])}
-    parts: list[Literal["fitted", "held out"] | None] = []
-    for run in runs:
-        whole = all(n in run for n in names)
-        name = trained.get(run.select(names).digest) if whole else None
-        parts.append(None if name is None else "held out" if name in spared else "fitted")
-    return parts
+    names, known = record.get("channels", []), {d["sha256"] for d in record.get("data", [])}
+    return [r.where for r in runs if all(n in r for n in names) and r.select(names).digest in known]
 
 
 def listed(names: Sequence[str]) -> str:
@@ -311,9 +300,8 @@ def listed(names: Sequence[str]) -> str:
 
 def _leaks(model: DFSM, runs: Sequence[Trajectory], intervals: Intervals | None) -> list[str]:
     """Test runs that were in the training data, or that intervals were calibrated on."""
-    parts, notes = parts_in_fit(model, runs), []
-    seen = [r.where for r, part in zip(runs, parts, strict=True) if part is not None]
-    if seen:
+    notes = []
+    if seen := of_the_fit(model, runs):
         notes.append(
             f"{len(seen)} of the {len(runs)} test runs were used in training ({listed(seen)}): "
             "their errors say little about new runs"

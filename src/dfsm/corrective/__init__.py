@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from dfsm.corrective.functions import Corrective, GaussianUnits, Perceptron
+from dfsm.corrective.functions import Corrective, GaussianUnits, Perceptron, ignoring
 from dfsm.corrective.gaussian_process import GP, fit_gp
 from dfsm.corrective.perceptron import MLP, fit_mlp
 from dfsm.corrective.rbf import RBF, IncrementalRBF, fit_rbf
@@ -30,6 +30,7 @@ __all__ = [
     "NoCorrection",
     "Perceptron",
     "fit_corrective",
+    "ignoring",
 ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -116,3 +117,8 @@ class Perceptron(eqx.Module):
 
 
 Corrective = GaussianUnits | Perceptron
+
+
+def ignoring(function: Corrective, columns: Sequence[int]) -> Corrective:
+    """The function with some inputs held at the middle of their range, whatever they are."""
+    return replace(function, scale=function.scale.at[np.array(columns, dtype=int)].set(jnp.inf))
