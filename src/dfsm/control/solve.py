@@ -43,6 +43,8 @@ _GOOD = ("solved", "acceptable")
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Scaled violations up to which a start counts as close to a solution.
 _NEAR = 1e-2
+# By which factor the bound on the distance from the training data is tightened at most.
+_TIGHTER = 4.0
 # Meshes are not refined beyond this many intervals.
 _MOST_INTERVALS = 5000
 
@@ -83,19 +85,47 @@ def solve(
     region = problem.plant.region
     if not method.stay_inside or region is None or not region.whitening.size:
         return _solution(problem, _solve_meshes(problem, method, guess), simulate)
-    kept = {"distance from the training data": (_distance, None, 1.0)}
-    inside = replace(problem, constraints={**problem.constraints, **kept})
     if isinstance(guess, Solution):
-        return _solution(inside, _solve_meshes(inside, method, guess), simulate)
+        return _solution(*_inside(problem, method, guess), simulate)
     # The distance bends the feasible set: from the optimum without it the solver needs tens of
     # iterations, from a guess hundreds.
     first = _solve_meshes(problem, method, guess)
     free = _solution(problem, first, simulate=False)
     if not free.solved:
         return _solution(problem, first, simulate)
-    record = _solve_meshes(inside, method, free)
-    record.prepend(first)
-    return _solution(inside, record, simulate)
+    inside, record = _inside(problem, method, free)
+    return _solution(inside, record.after(first), simulate)
+
+
+def _inside(
+    problem: OptimalControlProblem, method: Method, guess: Solution
+) -> tuple[OptimalControlProblem, _Record]:
+    """Solve with a bound on the distance from the training data, tightened step by step.
+
+    From far outside, the last bound at once costs hundreds of iterations or is never met.
+    """
+    farthest, done = max(_farthest(problem, guess), 1.0), None
+    steps = max(1, int(np.ceil(np.log(farthest) / np.log(_TIGHTER))))
+    for step in range(1, steps):
+        looser = _within(problem, farthest ** (1 - step / steps))
+        done = _solve_meshes(looser, method, guess).after(done)
+        if done.outcome.ending == "interrupted":
+            return looser, done
+        guess = _solution(looser, done, simulate=False)
+    inside = _within(problem, 1.0)
+    return inside, _solve_meshes(inside, method, guess).after(done)
+
+
+def _within(problem: OptimalControlProblem, limit: float) -> OptimalControlProblem:
+    kept = {"distance from the training data": (_distance, None, limit)}
+    return replace(problem, constraints={**problem.constraints, **kept})
+
+
+def _farthest(problem: OptimalControlProblem, found: Solution) -> float:
+    """Largest distance of a solution's nodes, see `Region.distance_chosen`."""
+    region = problem.plant.region
+    values = [_inputs(problem, run) for run in found.trajectories]
+    return max(float(region.distance_chosen(v).max()) for v in values) if region else 0.0
 
 
 def _distance(signals: Signals) -> Any:
@@ -229,12 +259,14 @@ class _Record:
             }
         )
 
-    def prepend(self, other: _Record) -> None:
-        """Count the meshes of another record before these."""
-        self.compile += other.compile
-        self.solve += other.solve
-        self.iterations += other.iterations
-        self.meshes = [*other.meshes, *self.meshes]
+    def after(self, other: _Record | None) -> _Record:
+        """Itself, with the meshes of another counted before its own."""
+        if other is not None:
+            self.compile += other.compile
+            self.solve += other.solve
+            self.iterations += other.iterations
+            self.meshes = [*other.meshes, *self.meshes]
+        return self
 
 
 def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -> Solution:
@@ -373,14 +405,18 @@ def trajectories_of(
 
 def _outside(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> float | None:
     """Share of the horizon with any input outside the training range."""
-    plant = problem.plant
-    if plant.region is None:
+    region = problem.plant.region
+    if region is None:
         return None
-    groups = ("controls", "disturbances", "states", "parameters")
-    names = [n for g in groups for n in plant.names(g)]
     shares = []
     for run in runs:
-        outside = np.asarray(plant.region.outside(run.select(names).values), dtype=float)
+        outside = np.asarray(region.outside(_inputs(problem, run)), dtype=float)
         # Each sample stands for half of the steps beside it.
         shares.append(np.trapezoid(outside, run.time) / run.duration)
     return float(np.mean(shares))
+
+
+def _inputs(problem: OptimalControlProblem, run: Trajectory) -> Array:
+    """All that the plant's functions see, ``(time, input)``."""
+    groups = ("controls", "disturbances", "states", "parameters")
+    return run.select([n for g in groups for n in problem.plant.names(g)]).values
