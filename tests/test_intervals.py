@@ -16,6 +16,7 @@ from dfsm.fit import fit
 from dfsm.intervals import load_intervals
 from dfsm.linear import LPV, LTI
 from dfsm.samples import FitSettings
+from dfsm.signals import Provenance
 from dfsm.simulate import simulate
 from dfsm.trajectory import Channel, Trajectory
 from dfsm.validate import validate
@@ -136,6 +137,12 @@ def test_runs_that_are_not_new_are_told(model, intervals):
     notes = validate(model, [run(101), run(300)], intervals=found).warnings
     assert "1 of the 2 test runs calibrated the intervals (run101)" in notes[0]
     assert notes[1] == f"intervals: {told}"
+    # So are runs that a refinement held out at first: it learns from them in the end.
+    groups = {"training": [f"run{k}" for k in range(1, 8)], "validation": ["run0"]}
+    record = {**model.provenance.record, "refinement": groups}
+    refined = replace(model, provenance=Provenance(record))
+    assert calibrate(refined, [run(0), run(100), run(101)]).warnings == (told,)
+    assert "used in training (run0)" in validate(refined, [run(0)]).warnings[0]
     assert intervals.warnings == ()
 
 

@@ -161,8 +161,8 @@ def refine(
     Returns
     -------
     RefineResult
-        A refined model is not worse on the runs held out than its start, and stable at all
-        schedule values if its start is.
+        A refined model was not worse on the runs held out than its start before it learnt from
+        them, and is stable at all schedule values if its start is.
 
     Raises
     ------
