@@ -1,7 +1,7 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [limits]
-    [control] [codesign] [peer]
+    [matched] [control] [codesign] [peer]
 
 Without names all but `peer`, which makes an environment of its own and installs jax-sysid there.
 """
@@ -21,6 +21,7 @@ from benchmarks import (
     control,
     derivatives,
     limits,
+    matched,
     parameters,
     peer,
     rollouts,
@@ -37,6 +38,7 @@ PARTS = {
     "scaling": scaling.run,
     "rollouts": rollouts.run,
     "limits": limits.run,
+    "matched": matched.run,
     "control": control.run,
     "codesign": codesign.run,
     "peer": peer.run,

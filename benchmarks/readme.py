@@ -211,6 +211,38 @@ def braking_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def matched_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors of rollouts, and of differences between rollouts under the same wind."""
+    heads = " | ".join(f"speed's difference, {name}" for name in figures["pairs"])
+    lines = [
+        "| correlation of errors | pitch | pitch rate | rotor speed | perturbed: pitch, speed "
+        f"| {heads} |",
+        "|---|---|---|---|---|" + "---|" * len(figures["pairs"]),
+    ]
+    for name, found in figures["models"].items():
+        closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
+        cells = [name, *(_two(v) for v in closed.values())]
+        cells.append(", ".join(_two(other[c]) for c in ("PtfmPitch", "GenSpeed")))
+        cells += [_two(errors[-1]) for errors in found["differences"]]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def slopes_table(figures: Mapping[str, Any]) -> list[str]:
+    """What the speed's derivative depends on, by differences of records."""
+    lines = [
+        "| pair of runs | speed (1/s) | pitch rate (rpm/s per deg/s) | blade pitch (rpm/s per deg) "
+        "| torque (10⁻⁵ rpm/s per kN m) |",
+        "|---|---|---|---|---|",
+    ]
+    for name, found in zip(figures["pairs"], figures["slopes"], strict=True):
+        values = [f"{found[c]:.3f}" for c in ("GenSpeed", "PtfmPitch_dot", "BldPitch1")]
+        cells = [*values, f"{1e5 * found['GenTq']:.1f}"]
+        signed = [c.replace("-", "\N{MINUS SIGN}") for c in cells]
+        lines.append(f"| {name} | {' | '.join(signed)} |")
+    return lines
+
+
 def sweep_table(figures: Mapping[str, Any]) -> list[str]:
     """The sweep of constant winds in one line per figure."""
     found = figures["sweep"]
@@ -377,6 +409,7 @@ ROLLOUT_TABLES = {
     "leak": leak_table,
 }
 LIMITS_TABLES = {"limits": limits_table, "field": field_table, "braking": braking_table}
+MATCHED_TABLES = {"matched": matched_table, "slopes": slopes_table}
 CODESIGN_TABLES = {"codesign": codesign_table, "adaptive": adaptive_table}
 # By the part of the figures that each shows.
 CONTROL_TABLES = {
@@ -406,6 +439,7 @@ def main() -> None:
     for part, group in (
         ("rollouts", ROLLOUT_TABLES),
         ("limits", LIMITS_TABLES),
+        ("matched", MATCHED_TABLES),
         ("codesign", CODESIGN_TABLES),
     ):
         if part in figures:

@@ -158,7 +158,7 @@ def judged(runs: Sequence[dfsm.Trajectory], found: Sequence[Array | None]) -> di
     for run, values in zip(runs, found, strict=True):
         if values is None:
             continue
-        truth = _recorded(run)
+        truth = recorded(run)
         low.append(_nrmse(_low_passed(run, values), _low_passed(run, truth)))
         whole.append(_nrmse(values, truth))
     none = [float("nan")] * len(STATES)
@@ -171,7 +171,7 @@ def judged(runs: Sequence[dfsm.Trajectory], found: Sequence[Array | None]) -> di
     }
 
 
-def _recorded(run: dfsm.Trajectory) -> Array:
+def recorded(run: dfsm.Trajectory) -> Array:
     """Recorded states; the same for all models, however they take derivatives."""
     specs = [dfsm.StateSpec(name="PtfmPitch", order=2), dfsm.StateSpec(name="GenSpeed")]
     return differentiate(run, specs).trajectory.window(demo().START).select(STATES).values

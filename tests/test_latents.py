@@ -19,7 +19,7 @@ from dfsm.latents import Poles, as_states, evolve, latent_path, poles
 from dfsm.linear import LPV, LTI, fit_linear
 from dfsm.parametrise import Parametrisation
 from dfsm.refine import RefineSettings, refine
-from dfsm.rollout_error import RolloutError, record_of
+from dfsm.rollout_error import ErrorWeights, RolloutError, record_of
 from dfsm.samples import FitSettings
 from dfsm.simulate import Status, initial_state, simulate
 from dfsm.storage import load, load_all, save
@@ -224,7 +224,7 @@ def test_slopes_written_out_are_those_of_the_model(model, kind):
 def test_sensitivities_agree_with_differences(model, runs, length):
     record = record_of(model, runs[0], 0.2, START, 40.0)
     parameters = Parametrisation.of(model, np.array([0.7]))
-    problem = RolloutError(parameters, [record], length, np.ones(1))
+    problem = RolloutError(parameters, [[record]], length, ErrorWeights(np.ones(1)))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)
     eps, slopes = 1e-6, []

@@ -14,7 +14,7 @@ import dfsm
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import limits, readme  # noqa: E402
+from benchmarks import limits, matched, readme  # noqa: E402
 from benchmarks.accuracy import demo  # noqa: E402
 
 
@@ -64,3 +64,26 @@ def test_tables_have_a_line_for_everything():
     assert line == "| speed | 5 % | 49 % | 13 % (95th percentile: 25 %) |"
     (line,) = readme.braking_table({"braking": {"LTI": [-5.1e-6, -3.85e-4]}})[2:]
     assert line == "| LTI | −0.5 | −38.5 |"
+
+
+def test_perturbed_runs_repeat_the_wind_and_waves_of_controlled_ones():
+    turbine = demo()
+    runs = [*turbine.runs(["06", "12"], range(1, 5)), *turbine.perturbed(testing=True)[:2]]
+    data = dfsm.Dataset(runs)
+    groups = data.matched([*turbine.settings(5).disturbances])
+    pairs = {tuple(sorted(data[k].name for k in group)) for group in groups if len(group) > 1}
+    names = ("iea15_2dof_06mps_s02", "iea15_2dof_12mps_s04")
+    assert pairs == {(name, f"{name}_ol") for name in names}
+
+
+def test_differences_of_records_tell_the_inertia():
+    turbine = demo()
+    known = turbine.BRAKING["GenSpeed"]["GenTq"]
+    (controlled,) = turbine.runs(["12"], range(4, 5))
+    perturbed = turbine.perturbed(testing=True)[1]
+    slopes = matched.speed_slopes(turbine, (controlled, perturbed))
+    assert slopes["GenTq"] == pytest.approx(known, rel=0.2)
+    # Blade pitch brakes, and so does the platform on its way back.
+    assert slopes["BldPitch1"] < 0
+    assert slopes["PtfmPitch_dot"] < 0
+    assert slopes["GenSpeed"] < 0

@@ -16,14 +16,14 @@ from scipy.signal import lsim
 from conftest import changed, write_config
 from dfsm.corrective import GaussianUnits, NoCorrection, Perceptron
 from dfsm.derivatives import StateSpec
-from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fit import fit
 from dfsm.linear import LTI
 from dfsm.parametrise import Parametrisation
 from dfsm.refine import RefineSettings, refine
 from dfsm.refine_stability import StabilityKept
 from dfsm.refine_start import start_network
-from dfsm.rollout_error import RolloutError, record_of
+from dfsm.rollout_error import ErrorWeights, RolloutError, record_of
 from dfsm.samples import FitSettings
 from dfsm.simulate import simulate
 from dfsm.storage import load
@@ -98,7 +98,7 @@ def test_the_runs_held_out_train_at_last(runs, biased):
     assert all(("validation" in entry) == (entry["stage"] < 2) for entry in result.history)
     records = [record_of(biased, run, CHOICES.step, None, None) for run in runs]
     parameters = Parametrisation.of(result.model, np.ones(2))
-    everything = RolloutError(parameters, records, None, np.ones(2))
+    everything = RolloutError(parameters, [[r] for r in records], None, ErrorWeights(np.ones(2)))
     error = everything.relative(np.zeros(parameters.size))
     assert result.history[-1]["training"] == pytest.approx(error, rel=1e-9)
 
@@ -112,6 +112,62 @@ def test_the_true_model_is_not_made_worse():
     assert result.after <= result.before
     test = driven(99, hidden=0.0)
     assert rollout_error(result.model, test) <= 1.05 * rollout_error(model, test)
+
+
+def test_correlated_errors_count_as_in_generalised_least_squares(runs, biased):
+    rho, count = 0.7, 3
+    parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
+    at = np.zeros(parameters.size)
+    records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:count]]
+    spread = np.sqrt(np.mean([r.states.var(axis=0) for r in records], axis=0))
+    errors = []
+    for run, record in zip(runs, records, strict=False):
+        with hushed():
+            rollout = simulate(biased, run, stop=20.0).trajectory.select(("q", "q_dot"))
+        errors.append(((rollout.values[2::2] - record.states[1:]) / spread).ravel())
+    covariance = (1 - rho) * np.eye(count) + rho
+    expected = np.einsum("it,ij,jt", errors, np.linalg.inv(covariance), errors)
+    problem = RolloutError(parameters, [records], None, ErrorWeights(np.ones(2), rho))
+    # The refinement averages inputs over its steps.
+    assert problem.cost(at) == pytest.approx(expected, rel=0.02)
+    alone = RolloutError(parameters, [records[:1]], None, ErrorWeights(np.ones(2), rho))
+    plain = RolloutError(parameters, [records[:1]], None, ErrorWeights(np.ones(2)))
+    assert alone.cost(at) == plain.cost(at)
+
+
+def following(seed: int, other: int | None = None) -> Trajectory:
+    """q'' = -4 q - 0.6 q' + 2 u + d + w, where u follows w, which no channel holds, and d is known.
+
+    `other` is the seed of something that is added to u.
+    """
+    rng = np.random.default_rng(seed)
+    d, w = (wander(rng, 0.5, TIME[-1], 2.0)(TIME) for _ in range(2))
+    u = 0.5 * w
+    if other is not None:
+        u = u + 0.3 * wander(np.random.default_rng(other), 0.3, TIME[-1], 2.0)(TIME)
+    B = np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]])
+    system = (OSCILLATOR_A, B, np.eye(2), np.zeros((2, 3)))
+    q = lsim(system, np.stack([u, d, w], axis=1), TIME)[1][:, 0]
+    channels = (Channel("q", "m"), Channel("u", "N"), Channel("d", "N"))
+    return Trajectory(TIME, np.stack([q, u, d], axis=1), channels, name=f"run{seed}")
+
+
+def test_runs_with_the_same_disturbances_show_what_controls_do():
+    runs = [following(s, other) for s in range(4) for other in (None, 50 + s)]
+    model = fit(runs, replace(SETTINGS, disturbances=("d",))).model
+    found = {}
+    for correlation in (0.0, 0.99):
+        choices = replace(CHOICES, windows=(None,), correlation=correlation)
+        with hushed():  # 0 cannot do better than the start
+            refined = refine(model, runs, choices)
+        found[correlation] = float(refined.model.f.coefficients[0, 1, 0])
+    # Least squares takes what u follows for what u does: 2 + 1 / 0.5, less what is added to u.
+    assert found[0.0] > 3
+    assert refined.improved
+    assert found[0.99] == pytest.approx(2.0, abs=0.3)
+    record = refined.model.provenance.record["refinement"]
+    # Runs that match have the same name here.
+    assert not set(record["validation"]) & set(record["training"])
 
 
 def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monkeypatch):
@@ -135,10 +191,11 @@ def test_the_seed_decides_which_runs_are_held_out(runs, biased):
     assert len(set(names)) > 1
 
 
-def test_slopes_agree_with_differences(runs, biased):
-    record = record_of(biased, runs[0], 0.1, 0.0, 20.0)
+@pytest.mark.parametrize("size", [1, 3])  # of a group of runs with correlated errors
+def test_slopes_agree_with_differences(runs, biased, size):
+    records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:size]]
     parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
-    problem = RolloutError(parameters, [record], 5.0, np.ones(2))
+    problem = RolloutError(parameters, [records], 5.0, ErrorWeights(np.ones(2), 0.7))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     JtJ, Jtr = problem.normal_equations(at)
     assert JtJ.shape == (parameters.size, parameters.size)

@@ -263,6 +263,48 @@ def test_split_is_by_run_and_seeded():
         Dataset([make()]).split()
 
 
+def matched_runs() -> list[Trajectory]:
+    """Two runs with the same wind up to its rounding, one with another wind."""
+    time, rng = 0.1 * np.arange(200), np.random.default_rng(0)
+    first, other = rng.normal(8, 1, (2, 200))
+    winds = {"a": first, "b": first + 1e-3 * rng.normal(size=200), "c": other, "d": other[::-1]}
+    channels = (Channel("wind", "m/s"), Channel("depth", "m"), Channel("torque", "kN-m"))
+    return [
+        Trajectory(
+            time, np.stack([w, np.full(200, 30.0), rng.normal(size=200)], axis=1), channels, name=n
+        )
+        for n, w in winds.items()
+    ]
+
+
+def test_runs_that_share_channels_are_found():
+    data = Dataset(matched_runs())
+
+    def groups(*names: str) -> set[str]:
+        return {"".join(sorted(data[k].name for k in g)) for g in data.matched(names)}
+
+    assert groups("wind") == groups("wind", "depth") == {"ab", "c", "d"}
+    assert groups("wind", "torque") == groups() == {"a", "b", "c", "d"}
+    # A constant says nothing about what the runs have in common.
+    assert groups("depth") == {"a", "b", "c", "d"}
+    later = Trajectory(data[0].time + 1, data[0].values, data[0].channels, name="later")
+    assert len(Dataset([data[0], later]).matched(["wind"])) == 2
+    with pytest.raises(DfsmError, match="no channel 'wave'"):
+        data.matched(["wave"])
+
+
+def test_runs_that_share_channels_stay_on_one_side():
+    data = Dataset(matched_runs())
+    for seed in range(10):
+        train, test = ({r.name for r in part} for part in data.split(0.25, seed, together=["wind"]))
+        assert train | test == set("abcd")
+        assert not train & test
+        assert ("a" in train) == ("b" in train)
+    same = Dataset(r for r in data if r.name in "ab")
+    with pytest.raises(DfsmError, match="all runs have the same wind, so none can be held out"):
+        same.split(together=["wind"])
+
+
 def test_a_dataset_refuses_none_and_twice_and_strangers():
     with pytest.raises(DfsmError, match="no runs were given"):
         Dataset([])

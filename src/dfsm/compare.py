@@ -277,7 +277,10 @@ def _shares(
     first: Candidate,
 ) -> tuple[Dataset, Dataset]:
     if validation is None:
-        return Dataset(runs).split(hold_out, first.settings.seed)
+        data, settings = Dataset(runs), first.settings
+        # One that has to be computed first is left out; the others tell runs apart, too.
+        together = [n for n in settings.disturbances if n in data.names]
+        return data.split(hold_out, settings.seed, together)
     judged = Dataset(validation)
     digests = {run.digest for run in judged}
     training = [run for run in runs if run.digest not in digests]

@@ -33,7 +33,7 @@ from dfsm.parametrise import Parametrisation
 from dfsm.progress import track
 from dfsm.refine_stability import StabilityKept
 from dfsm.refine_start import start_latents, start_network
-from dfsm.rollout_error import RolloutError, record_of
+from dfsm.rollout_error import ErrorWeights, RolloutError, record_of
 from dfsm.settings import require, settings
 from dfsm.signals import Provenance
 from dfsm.trajectory import Dataset, Trajectory
@@ -69,6 +69,10 @@ class RefineSettings:
         about its own spread, beside the sum of squared errors relative to their spread.
     hold_out
         Share of the runs that decide when to stop, at least one; last of all they train, too.
+    correlation
+        Between the errors of runs that have the same disturbances and differ in their controls:
+        at 0.8, the difference of two such runs counts five times and their mean about half, see
+        `rollout_error.py`, and both are held out or neither is. 0 takes all runs as unrelated.
     weights
         Weight of a state's squared error, by name; 1 where nothing is given.
     seconds
@@ -83,6 +87,7 @@ class RefineSettings:
     network: int = 0
     decay: float = 0.0
     hold_out: float = 0.2
+    correlation: float = 0.0
     weights: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
 
@@ -98,6 +103,8 @@ class RefineSettings:
         require(self.decay >= 0, "refine.decay", self.decay, "0 or more")
         require(self.iterations >= 1, "refine.iterations", self.iterations, "at least 1")
         require(0 < self.hold_out < 1, "refine.hold_out", self.hold_out, "a share between 0 and 1")
+        good = 0 <= self.correlation < 1
+        require(good, "refine.correlation", self.correlation, "at least 0 and less than 1")
         for name, weight in self.weights.items():
             require(weight >= 0, f"refine.weights.{name}", weight, "0 or more")
 
@@ -114,7 +121,8 @@ class RefineResult:
         Whether it is the refined one.
     before, after
         Mean squared error of the validation rollouts relative to each state's variance, over
-        the last of the windows; `after` is that of the best refined model before it saw them.
+        the last of the windows, weighted as in training; `after` is that of the best refined
+        model before it saw them.
     history
         One entry per step: stage, training and validation error; of the steps on all runs, which
         come last, the training error alone.
@@ -175,16 +183,23 @@ def refine(
         Refinement did not help and the model given is returned.
     """
     choices = choices or RefineSettings()
-    training, validation = Dataset(runs).split(choices.hold_out, seed)
+    data, common = Dataset(runs), ()
+    if choices.correlation:
+        # What is computed from others is the same where they are.
+        common = [n for n in model.signals.names("disturbances") if n in data.names]
+    training, validation = data.split(choices.hold_out, seed, common)
     weights = _weights(model, choices)
-    train = [record_of(model, run, choices.step, start, stop) for run in training]
-    held = [record_of(model, run, choices.step, start, stop) for run in validation]
+    train, held = (
+        [[record_of(model, part[k], choices.step, start, stop) for k in group] for group in groups]
+        for part, groups in ((d, d.matched(common)) for d in (training, validation))
+    )
+    train_runs = [record for group in train for record in group]
     began = clock.perf_counter()
 
     def late() -> bool:
         return choices.seconds is not None and clock.perf_counter() - began > choices.seconds
 
-    spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in train], axis=0))
+    spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in train_runs], axis=0))
     parameters = Parametrisation.of(model, spread)
     final = RolloutError(parameters, held, choices.windows[-1], weights)
     at = np.zeros(parameters.size)
@@ -192,18 +207,18 @@ def refine(
     started = model
     if choices.latents and not model.signals.latents:
         drivers = _drivers(model, choices)
-        started = start_latents(started, train, choices.latents, spread, drivers)
+        started = start_latents(started, train_runs, choices.latents, spread, drivers)
     if choices.network and model.e is None:
         started = start_network(started, choices.network, spread, seed)
     if started is not model:
         parameters = Parametrisation.of(started, spread)
         final = RolloutError(parameters, held, choices.windows[-1], weights)
         at = np.zeros(parameters.size)
-    best, samples = at, sum(r.states[1:].size for r in train)
+    best, samples = at, sum(r.states[1:].size for r in train_runs)
     kept = StabilityKept(parameters, samples)
     history: list[dict[str, float]] = []
     for stage, length in enumerate(choices.windows):
-        problem = RolloutError(parameters, train, length, weights, choices.decay, kept)
+        problem = RolloutError(parameters, train, length, weights, kept)
         check = RolloutError(parameters, held, length, weights)
         at, found = _stage(problem, check, at, choices.iterations, late)
         history += [{"stage": stage, **entry} for entry in found]
@@ -213,12 +228,12 @@ def refine(
     if after < before and not late():
         length, stage = choices.windows[-1], len(choices.windows)
         count = sum(entry["stage"] == stage - 1 for entry in history)
-        problem = RolloutError(parameters, [*train, *held], length, weights, choices.decay, kept)
+        problem = RolloutError(parameters, [*train, *held], length, weights, kept)
         best, found = _on_all(problem, best, count, late)
         history += [{"stage": stage, **entry} for entry in found]
     refined = parameters.at(jnp.asarray(best))
     if refined.signals.latents:
-        refined = with_latent_range(refined, [r.latent_states(refined) for r in train])
+        refined = with_latent_range(refined, [r.latent_states(refined) for r in train_runs])
     names = {"training": [r.name for r in training], "validation": [r.name for r in validation]}
     return _result(model, refined, (before, after), history, names)
 
@@ -234,7 +249,7 @@ def _drivers(model: DFSM, choices: RefineSettings) -> tuple[str, ...] | None:
     return choices.latent_inputs
 
 
-def _weights(model: DFSM, choices: RefineSettings) -> Array:
+def _weights(model: DFSM, choices: RefineSettings) -> ErrorWeights:
     names = [c.name for c in model.signals.observed]
     unknown = [n for n in choices.weights if n not in names]
     if unknown:
@@ -242,7 +257,8 @@ def _weights(model: DFSM, choices: RefineSettings) -> Array:
             f"refine.weights names '{unknown[0]}', which is no state: choose among "
             f"{', '.join(names)}"
         )
-    return np.array([choices.weights.get(n, 1.0) for n in names])
+    states = np.array([choices.weights.get(n, 1.0) for n in names])
+    return ErrorWeights(states, choices.correlation, choices.decay)
 
 
 # -- stages -------------------------------------------------------------------------------------

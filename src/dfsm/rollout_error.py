@@ -1,11 +1,13 @@
 """The error of rollouts over windows of recorded runs, as a function of a model's parameters.
 
-Exact slopes come from forward sensitivities, S = dξ/dθ, taken through the same Runge-Kutta steps as
-the states,
+Least squares, generalised where runs have the same disturbances: what a model does not see of these
+errs in all of them alike, so that their errors r₁ … r_m correlate, by ρ say, and
 
-    Ṡ = (∂f̂/∂ξ) S + ∂f̂/∂θ ,
+    (Σ |rᵢ|² - ρ / (1 + (m - 1) ρ) |Σ rᵢ|²) / (1 - ρ)
 
-run by run, so that memory does not grow with the number of runs.
+is what counts (Aitken 1935, for equal correlations). It weighs differences between such runs, which
+are what controls and states do, more than what the runs have in common. Slopes come run by run, so
+that memory does not grow with the number of runs.
 """
 
 from __future__ import annotations
@@ -25,20 +27,16 @@ from scipy.linalg import get_blas_funcs
 
 from dfsm.derivatives import differentiate
 from dfsm.filters import moving_average
-from dfsm.integrate import clip_range, exogenous_groups, rate, rk4
+from dfsm.integrate import exogenous_groups, rk4
 from dfsm.latents import Poles, as_states, evolve, poles, rest
 from dfsm.model import DFSM
 from dfsm.parametrise import Parametrisation
 from dfsm.refine_stability import StabilityKept
+from dfsm.rollout_slopes import FAR, sensitivities
 from dfsm.signals import with_computed
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array, IntArray
 
-# A rollout that leaves the training range this many half-ranges from its middle is cut off there:
-# the error stays finite and still has a slope.
-_FAR = 30.0
-# Steps whose slopes are computed at once.
-_BLOCK = 48
 _SYRK: Any = get_blas_funcs("syrk", dtype=np.float64)
 
 
@@ -169,103 +167,147 @@ def _windows(record: Record, length: float | None) -> _Windows:
     )
 
 
-# States, and slopes of the latent pairs.
-_At = tuple[jax.Array, jax.Array]
+@dataclass(frozen=True)
+class ErrorWeights:
+    """What errors count.
+
+    Attributes
+    ----------
+    states
+        Weights of the observed states' squared errors, shape ``(state,)``.
+    correlation
+        ρ between the errors of runs with the same disturbances, at least 0 and less than 1.
+    decay
+        Weight of the parameters' squared deviations.
+    """
+
+    states: Array
+    correlation: float = 0.0
+    decay: float = 0.0
+
+    def whitening(self, runs: int) -> tuple[float, float]:
+        """Factors of Σ |rᵢ|² and -|Σ rᵢ|², for so many runs with the same disturbances."""
+        if runs == 1:
+            return 1.0, 0.0
+        own = 1 / (1 - self.correlation)
+        return own, own * self.correlation / (1 + (runs - 1) * self.correlation)
 
 
 class RolloutError:
-    """|r|² of rollouts over windows, with JᵀJ and Jᵀr by forward sensitivities.
+    """Squared errors of rollouts over windows, with JᵀJ and Jᵀr by forward sensitivities.
 
     Parameters
     ----------
     parameters
         What may change.
-    records
-        Runs to follow.
+    groups
+        Runs to follow; those of one group have the same disturbances at the same times.
     length
         Of the windows in s; None takes whole runs.
-    weights
-        Of the observed states' squared errors.
-    decay
-        Weight of the squared deviations, added to |r|².
+    counts
+        See `ErrorWeights`.
     kept
-        What else adds to |r|².
+        What else adds to the cost.
     """
 
     def __init__(
         self,
         parameters: Parametrisation,
-        records: Sequence[Record],
+        groups: Sequence[Sequence[Record]],
         length: float | None,
-        weights: Array,
-        decay: float = 0.0,
+        counts: ErrorWeights,
         kept: StabilityKept | None = None,
     ) -> None:
-        self._decay, self._kept = decay, kept
-        self._batches = [_windows(r, length) for r in records]
-        overall = np.concatenate([r.states for r in records]).std(axis=0)
-        self._scales = [
+        self._parameters, self._counts, self._kept = parameters, counts, kept
+        self._groups = [tuple(_windows(r, length) for r in group) for group in groups]
+        overall = np.concatenate([r.states for group in groups for r in group]).std(axis=0)
+        self._scales = []
+        for group in groups:
+            spread = np.sqrt(np.mean([r.states.var(axis=0) for r in group], axis=0))
             # A state that hardly moves in one run must not outweigh all others.
-            np.sqrt(weights) / np.maximum(r.states.std(axis=0), 0.1 * overall)
-            for r in records
-        ]
-        self._count = sum(b.states[:, 1:].size for b in self._batches)
-        self._parameters = parameters
+            self._scales.append(np.sqrt(counts.states) / np.maximum(spread, 0.1 * overall))
+        self._count = sum(w.states[:, 1:].size for group in self._groups for w in group)
 
-    def _over_runs(self, function: Callable[..., Any], weights: Array) -> list[Any]:
+    def _over_groups(self, function: Callable[..., Any], weights: Array) -> list[Any]:
         w = jnp.asarray(weights)
 
-        def one(k: int) -> Any:
-            given = self._parameters, w, self._batches[k], self._scales[k]
-            return jax.block_until_ready(function(*given))
+        def one(group: tuple[_Windows, ...], scale: Array) -> Any:
+            factors = self._counts.whitening(len(group))
+            return function(self._parameters, w, group, scale, factors)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            return list(pool.map(one, range(len(self._batches))))
+            return list(pool.map(one, self._groups, self._scales))
 
     def cost(self, weights: Array) -> float:
-        """|r|² and what is added to it, infinite where a rollout is not finite."""
+        """All that is to be made small, infinite where a rollout is not finite."""
         extra = 0.0 if self._kept is None else self._kept.cost(weights)
         if not np.isfinite(extra):
             return np.inf
-        return self.relative(weights) * self._count + self._decay * float(weights @ weights) + extra
+        decay = self._counts.decay * float(weights @ weights)
+        return self.relative(weights) * self._count + decay + extra
 
     def relative(self, weights: Array) -> float:
         """Mean square of r: 1 is as wrong as a constant; infinite where one is not finite."""
-        total = float(np.sum([float(v) for v in self._over_runs(_square, weights)]))
+        total = sum(self._over_groups(_square, weights))
         return total / self._count if np.isfinite(total) else np.inf
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
         """JᵀJ and Jᵀr of all of it."""
-        parts = self._over_runs(_products, weights)
+        parts = self._over_groups(_products, weights)
         JtJ, Jtr = (reduce(np.add, [p[k] for p in parts]) for k in (0, 1))
         JtJ += np.triu(JtJ, 1).T
         if self._kept is not None:
-            JtJ, Jtr = (
-                a + b for a, b in zip((JtJ, Jtr), self._kept.normal_equations(weights), strict=True)
-            )
-        return JtJ + self._decay * np.eye(len(Jtr)), Jtr + self._decay * weights
+            kept = self._kept.normal_equations(weights)
+            JtJ, Jtr = (a + b for a, b in zip((JtJ, Jtr), kept, strict=True))
+        decay = self._counts.decay
+        return JtJ + decay * np.eye(len(Jtr)), Jtr + decay * weights
+
+
+def _square(
+    parameters: Parametrisation,
+    w: jax.Array,
+    group: Sequence[_Windows],
+    scale: Array,
+    factors: tuple[float, float],
+) -> float:
+    """What the errors over the windows of one group count, by the factors of `whitening`."""
+    each = [np.asarray(_errors(parameters, w, windows, scale)) for windows in group]
+    own, shared = factors
+    return float(own * np.sum(np.square(each)) - shared * np.sum(np.sum(each, axis=0) ** 2))
 
 
 @eqx.filter_jit
-def _square(
-    parameters: Parametrisation, w: jax.Array, windows: _Windows, scale: jax.Array
+def _errors(
+    parameters: Parametrisation, w: jax.Array, windows: _Windows, scale: Array
 ) -> jax.Array:
-    """|r|² over the windows of one run."""
+    """Errors over the windows of one run, scaled, ``(window, time, state)``."""
     model = parameters.at(w).prepared()
     h = jnp.full(windows.states.shape[1] - 1, windows.step)
-    starts = _starts(model, windows)
-    follow = jax.vmap(lambda x0, v: rk4(model, x0, h, v, _FAR))
-    xs = follow(starts, jnp.asarray(windows.inputs))
-    return jnp.sum(((xs[:, 1:, : len(scale)] - windows.states[:, 1:]) * scale) ** 2)
+    follow = jax.vmap(lambda x0, v: rk4(model, x0, h, v, FAR))
+    xs = follow(_starts(model, windows), jnp.asarray(windows.inputs))
+    return (xs[:, 1:, : len(scale)] - windows.states[:, 1:]) * scale
 
 
 def _products(
-    parameters: Parametrisation, w: jax.Array, windows: _Windows, scale: Array
+    parameters: Parametrisation,
+    w: jax.Array,
+    group: Sequence[_Windows],
+    scale: Array,
+    factors: tuple[float, float],
 ) -> tuple[Array, Array]:
-    """Upper half of JᵀJ, and Jᵀr, over the windows of one run."""
-    J, r = (np.asarray(a) for a in _residuals(parameters, w, windows, scale))
-    # BLAS computes one half only, which is most of the time of a step with many parameters.
-    return _SYRK(1.0, J.T), J.T @ r
+    """Upper half of JᵀJ, and Jᵀr, over the windows of one group; `factors` as in `_square`."""
+    own, shared = factors
+    JtJ, Jtr, J_sum, r_sum = 0.0, 0.0, 0.0, 0.0
+    for windows in group:
+        J, r = (np.asarray(a) for a in _residuals(parameters, w, windows, scale))
+        # BLAS computes one half only, which is most of the time of a step with many parameters.
+        JtJ, Jtr = JtJ + _SYRK(own, J.T), Jtr + own * (J.T @ r)
+        if shared:
+            J_sum, r_sum = np.add(J_sum, J), np.add(r_sum, r)
+    if shared:
+        J_sum, r_sum = np.asarray(J_sum), np.asarray(r_sum)
+        JtJ, Jtr = JtJ - _SYRK(shared, J_sum.T), Jtr - shared * (J_sum.T @ r_sum)
+    return np.asarray(JtJ), np.asarray(Jtr)
 
 
 @eqx.filter_jit
@@ -275,199 +317,12 @@ def _residuals(
     """J and r over the windows of one run."""
     starts = _starts(parameters.at(w), windows)
     slopes = _start_slopes(parameters, w, windows)
-    follow = partial(_sensitivities, parameters, w, windows.step)
+    follow = partial(sensitivities, parameters, w, windows.step)
     each = (starts, slopes, jnp.asarray(windows.inputs))
     xs, S = jax.lax.map(lambda one: follow(*one), each)
     r = (xs[..., : len(scale)] - windows.states[:, 1:]) * scale
     J = (S * scale[:, None]).reshape(-1, w.size)
     return J, r.ravel()
-
-
-def _sensitivities(
-    parameters: Parametrisation,
-    w: jax.Array,
-    step: float,
-    x0: jax.Array,
-    pairs0: jax.Array,
-    v: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """States and slopes of the observed ones after every step, as `rk4` would find them.
-
-    Once the path is known, what each step does to the slopes, S ← Φ S + G, follows for all steps
-    at once; only that recursion is left to march. A latent pair depends on its own parameters
-    alone, so that its slopes are few and travel with the states.
-
-    Parameters
-    ----------
-    parameters, w
-        The model.
-    step
-        In s.
-    x0
-        States at the start, shape ``(state,)``.
-    pairs0
-        Slopes of the latent pairs there, shape ``(pair, 2, own)``.
-    v
-        Exogenous inputs at ends and middles, ``(2 step + 1, exogenous)``.
-
-    Returns
-    -------
-    tuple of Array
-        Shapes ``(step, state)`` and ``(step, observed state, parameter)``.
-    """
-    model = parameters.at(w)
-    path = _path(parameters, model, step, x0, pairs0, v)
-    observed, steps = len(model.signals.observed), len(path.states)
-
-    def along(S: jax.Array, part: _Path) -> tuple[jax.Array, jax.Array]:
-        return jax.lax.scan(_advance, S, _transitions(parameters, w, model, step, part))
-
-    # Blocks stay in the cache; beyond the end the last step is repeated, and dropped again.
-    size = min(_BLOCK, steps)
-    count = -(-steps // size)
-
-    def blocks(a: jax.Array) -> jax.Array:
-        end = [(0, count * size - steps)] + [(0, 0)] * (a.ndim - 1)
-        return jnp.pad(a, end, mode="edge").reshape(count, size, *a.shape[1:])
-
-    S0 = jnp.zeros((observed, w.size))
-    S = jax.lax.scan(along, S0, jax.tree.map(blocks, path))[1]
-    return path.states, S.reshape(count * size, *S0.shape)[:steps]
-
-
-def _advance(S: jax.Array, transition: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    S = transition[0] @ S + transition[1]
-    return S, S
-
-
-def _transitions(
-    parameters: Parametrisation, w: jax.Array, model: DFSM, step: float, path: _Path
-) -> tuple[jax.Array, jax.Array]:
-    """Φ and G of every step, S ← Φ S + G.
-
-    Parameters
-    ----------
-    parameters, w, model
-        What may change, how much it has changed, and the model that makes.
-    step
-        In s.
-    path
-        Some steps of the rollout.
-
-    Returns
-    -------
-    tuple of Array
-        Shapes ``(step, observed state, observed state)`` and ``(step, observed state, parameter)``.
-    """
-    observed, columns = len(model.signals.observed), parameters.latent_columns
-    A = jax.vmap(jax.vmap(partial(_state_matrix, model.prepared())))(path.inputs)
-    own = A[..., :observed]
-    free = path.free[:, :observed]
-    weights = _stage_weights(own, step) * free[:, None, :, None]
-    through = jnp.einsum("tiab,tibc->tac", weights, own)
-    grown = parameters.slopes(w, model, path.inputs, weights)
-    if columns.size:
-        coupling = A[..., observed:].reshape(*A.shape[:3], -1, 2)
-        by_pair = jnp.einsum("tiab,tibkc,tikcq->takq", weights, coupling, path.pairs)
-        grown = grown.at[..., columns].add(by_pair)
-    return free[..., None] * jnp.eye(observed) + through, grown
-
-
-class _Path(NamedTuple):
-    """A rollout with what happens at the four stages of each step.
-
-    Attributes
-    ----------
-    states
-        At the ends of the steps, ``(step, state)``.
-    free
-        1 where a state was not held at the end of its range there, else 0; same shape.
-    inputs
-        I at the stages, ``(step, stage, input)``.
-    pairs
-        Slopes of the latent pairs at the stages, ``(step, stage, pair, 2, own)``.
-    """
-
-    states: jax.Array
-    free: jax.Array
-    inputs: jax.Array
-    pairs: jax.Array
-
-
-def _path(
-    parameters: Parametrisation,
-    plain: DFSM,
-    step: float,
-    x0: jax.Array,
-    pairs0: jax.Array,
-    v: jax.Array,
-) -> _Path:
-    """March states and latent slopes; arguments as for `_sensitivities`, `plain` is the model."""
-    model, dynamics = plain.prepared(), poles(plain)
-    low, high = clip_range(model, _FAR)
-    observed = len(plain.signals.observed)
-    M = jnp.stack([-dynamics.decay, dynamics.frequency, -dynamics.frequency, -dynamics.decay])
-    M = M.T.reshape(-1, 2, 2)
-
-    def slope(at: _At, v: jax.Array) -> tuple[_At, jax.Array]:
-        x, P = at
-        inputs = model.join(x, *exogenous_groups(model, v))
-        grown = M @ P + parameters.latent_slopes(plain, inputs) if P.size else P
-        return (rate(model, x, v), grown), inputs
-
-    def advance(at: _At, drive: tuple[jax.Array, ...]) -> tuple[_At, _Path]:
-        v0, vm, v1 = drive
-        stages = [at]
-        k1, i1 = slope(stages[0], v0)
-        stages.append(_moved(at, k1, step / 2))
-        k2, i2 = slope(stages[1], vm)
-        stages.append(_moved(at, k2, step / 2))
-        k3, i3 = slope(stages[2], vm)
-        stages.append(_moved(at, k3, step))
-        k4, i4 = slope(stages[3], v1)
-        total = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-        x, P = _moved(at, total, step)
-        held = jnp.clip(x, low, high)
-        free = jnp.where(held == x, 1.0, 0.0)
-        P = P * free[observed:].reshape(-1, 2)[..., None]
-        pairs = jnp.stack([s[1] for s in stages])
-        return (held, P), _Path(held, free, jnp.stack([i1, i2, i3, i4]), pairs)
-
-    return jax.lax.scan(advance, (x0, pairs0), (v[:-2:2], v[1::2], v[2::2]))[1]
-
-
-def _moved(at: _At, k: _At, dt: float) -> _At:
-    return at[0] + dt * k[0], at[1] + dt * k[1]
-
-
-def _state_matrix(model: DFSM, inputs: jax.Array) -> jax.Array:
-    """∂f̂/∂ξ of the observed states at one input vector, ``(observed state, state)``."""
-    x, *others = model.split(inputs)
-    observed = len(model.signals.observed)
-    return jax.jacrev(lambda x: model.derivative(x, *others)[:observed])(x)
-
-
-def _stage_weights(A: jax.Array, h: float) -> jax.Array:
-    """How what is added to dS/dt at each of the four stages of a step enters S at its end.
-
-    Parameters
-    ----------
-    A
-        ∂f̂/∂ξ at the stages, ``(step, stage, state, state)``.
-    h
-        Length of the steps in s.
-
-    Returns
-    -------
-    Array
-        Matrices of the same shape; from unrolling the classical Runge-Kutta step.
-    """
-    _, A2, A3, A4 = (A[:, i] for i in range(4))
-    one = jnp.broadcast_to(jnp.eye(A.shape[-1]), A2.shape)
-    w3 = 2 * one + h * A4
-    w2 = 2 * one + h / 2 * w3 @ A3
-    w1 = one + h / 2 * w2 @ A2
-    return h / 6 * jnp.stack([w1, w2, w3, one], axis=1)
 
 
 def _start_slopes(parameters: Parametrisation, w: jax.Array, windows: _Windows) -> jax.Array:

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Role = Literal["state", "control", "disturbance", "output", "parameter"]
 
+# Share of its standard deviation within which a channel is the same in two runs.
+_SAME = 0.01
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -445,7 +448,43 @@ class Dataset(Sequence[Trajectory]):
         """Keep a time window (s) of every run, see `Trajectory.window`."""
         return Dataset(r.window(start, stop) for r in self.runs)
 
-    def split(self, test_fraction: float = 0.2, seed: int = 0) -> tuple[Dataset, Dataset]:
+    def matched(self, names: Iterable[str]) -> tuple[tuple[int, ...], ...]:
+        """Group the runs by whether some channels are the same in them, at the same times.
+
+        Parameters
+        ----------
+        names
+            Disturbances, say: a simulation that was repeated with other controls matches the first.
+
+        Returns
+        -------
+        tuple of tuple of int
+            Indices of the runs of every group. Channels are the same where they are less than one
+            hundredth of their standard deviation apart (RMS), which leaves room for rounding; those
+            that are constant in a run do not make it match another.
+        """
+        names = tuple(names)
+        if not names:
+            return tuple((k,) for k in range(len(self.runs)))
+        parts = [run.select(names) for run in self.runs]
+        means = np.array([p.values.mean(axis=0) for p in parts])
+        limits = np.array([_SAME * p.values.std(axis=0) for p in parts])
+        groups: list[list[int]] = []
+        for k, part in enumerate(parts):
+            for group in groups:
+                first = group[0]
+                # Signals that are close in the mean square have means that are close, too.
+                near = (np.abs(means[k] - means[first]) <= limits[first]).all()
+                if near and limits[first].any() and _same(parts[first], part, limits[first]):
+                    group.append(k)
+                    break
+            else:
+                groups.append([k])
+        return tuple(tuple(group) for group in groups)
+
+    def split(
+        self, test_fraction: float = 0.2, seed: int = 0, together: Iterable[str] = ()
+    ) -> tuple[Dataset, Dataset]:
         """Split by run, never within one: neighbouring samples are not independent.
 
         Parameters
@@ -454,6 +493,8 @@ class Dataset(Sequence[Trajectory]):
             Share of the runs for the second part, rounded to at least one run.
         seed
             Seed of the draw.
+        together
+            Channels: runs in which they are the same stay on one side, see `matched`.
 
         Returns
         -------
@@ -469,8 +510,19 @@ class Dataset(Sequence[Trajectory]):
             raise DfsmError(f"test_fraction is {test_fraction}, expected between 0 and 1")
         if len(self) < 2:
             raise DfsmError("one run cannot be split into training and test: give more runs")
+        together = tuple(together)
+        groups = self.matched(together)
+        if len(groups) < 2:
+            raise DfsmError(
+                f"all runs have the same {', '.join(together)}, so none can be held out to judge "
+                "what is learned from the others: give runs with other disturbances, too"
+            )
         n_test = min(len(self) - 1, max(1, round(test_fraction * len(self))))
-        test = set(np.random.default_rng(seed).permutation(len(self))[:n_test].tolist())
+        test: set[int] = set()
+        # One group is always left to train with.
+        for k in np.random.default_rng(seed).permutation(len(groups))[:-1]:
+            if len(test) < n_test:
+                test.update(groups[k])
         return (
             Dataset(r for i, r in enumerate(self.runs) if i not in test),
             Dataset(r for i, r in enumerate(self.runs) if i in test),
@@ -480,6 +532,13 @@ class Dataset(Sequence[Trajectory]):
         """Lay the samples of all runs below each other, shape ``(sample, channel)``."""
         names = tuple(names)
         return np.concatenate([r.select(names).values for r in self.runs])
+
+
+def _same(first: Trajectory, other: Trajectory, limits: Array) -> bool:
+    """Whether all channels are at most so far apart, in the mean square and at the same times."""
+    if first.time.shape != other.time.shape or not np.allclose(first.time, other.time):
+        return False
+    return bool((np.mean((first.values - other.values) ** 2, axis=0) <= limits**2).all())
 
 
 def _check_time(time: Array, where: str) -> None:

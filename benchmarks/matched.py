@@ -1,0 +1,81 @@
+"""What controls do, learned and tested by runs with the same wind and waves and other controls.
+
+Five of the turbine's training runs repeat wind and waves of others with perturbed controls, and so
+do its three perturbed test runs. What a model does not see of the wind is the same in both runs of
+such a pair, so that the difference between them shows what the controls did, and nothing else. The
+demo's refinement is repeated with such runs taken as unrelated, as in the demo, and with errors
+that correlate.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+import dfsm
+from benchmarks.accuracy import demo
+from benchmarks.rollouts import STATES, errors, low_passed, recorded, uncorrected
+from dfsm.types import Array
+
+CORRELATIONS = (0.0, 0.8)
+SLOW = 0.15  # Hz, for derivatives of differences
+STEP = 0.05  # s
+
+Pair = tuple[dfsm.Trajectory, dfsm.Trajectory]
+
+
+def run() -> dict[str, Any]:
+    """Errors of rollouts and of differences, and what differences of records tell by themselves."""
+    turbine, found = demo(), {}
+    winds = turbine.WINDS["all winds"]
+    closed = turbine.runs(winds, range(1, 9))
+    training = [*closed, *turbine.perturbed(testing=False)]
+    tests, perturbed = turbine.runs(winds, range(9, 11)), turbine.perturbed(testing=True)
+    pairs = [(next(c for c in closed if p.name == f"{c.name}_ol"), p) for p in perturbed]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dfsm.DfsmWarning)
+        for correlation in CORRELATIONS:
+            refinement = replace(turbine.REFINEMENT, correlation=correlation)
+            model = dfsm.fit(training, uncorrected(turbine), refinement).model
+            found[str(correlation)] = {
+                "closed loop": errors([model], tests),
+                "perturbed": errors([model], perturbed),
+                "differences": [difference_errors(model, pair) for pair in pairs],
+            }
+    names = [p.name.removeprefix("iea15_2dof_").removesuffix("_ol") for p in perturbed]
+    slopes = [speed_slopes(turbine, pair) for pair in pairs]
+    return {"pairs": names, "models": found, "slopes": slopes}
+
+
+def difference_errors(model: dfsm.DFSM, pair: Pair) -> list[float]:
+    """NRMSE per state of the difference between two rollouts, below the cutoff of `rollouts`."""
+    rollouts = [dfsm.simulate(model, r, start=demo().START).trajectory for r in pair]
+    found = _difference([r.select(STATES).values for r in rollouts])
+    truth = _difference([recorded(r) for r in pair])
+    return list(np.sqrt(np.mean((found - truth) ** 2, axis=0)) / truth.std(axis=0))
+
+
+def _difference(values: Sequence[Array], cutoff: float = 0.5) -> Array:
+    return low_passed(values[1] - values[0], STEP, cutoff)
+
+
+def speed_slopes(turbine: Any, pair: Pair) -> dict[str, float]:
+    """How the speed's derivative depends on states and controls, by least squares on differences.
+
+    No wind enters, and no coefficient is given. In rpm/s per rpm, deg, deg/s and kN m.
+    """
+    start = turbine.START
+    states = _difference([recorded(r) for r in pair], SLOW)
+    controls = _difference(
+        [r.window(start).select(("BldPitch1", "GenTq")).values for r in pair], SLOW
+    )
+    speed = STATES.index("GenSpeed")
+    slope = np.gradient(states[:, speed], STEP)
+    names = ("GenSpeed", "PtfmPitch_dot", "BldPitch1", "GenTq")
+    inputs = np.column_stack([states[:, speed], states[:, STATES.index("PtfmPitch_dot")], controls])
+    coefficients = np.linalg.lstsq(inputs, slope, rcond=None)[0]
+    return dict(zip(names, coefficients.tolist(), strict=True))
