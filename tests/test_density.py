@@ -154,6 +154,12 @@ def test_an_optimum_stays_near_the_data_if_asked(model):
     assert len(again.meshes) == np.ceil(np.log(far) / np.log(4))
     assert len(kept.meshes) == len(again.meshes) + 1 > 2
     assert again.objective == pytest.approx(kept.objective, rel=1e-6)
+    # Only the last bound is worth finer meshes.
+    refined = solve(problem, replace(method, refine=1e-6))
+    intervals = [mesh["intervals"] for mesh in refined.meshes]
+    assert intervals[: len(kept.meshes)] == [20] * len(kept.meshes)
+    assert refined.error <= 1e-6
+    assert max(intervals) > 20
 
 
 def test_a_single_run_is_judged_by_its_quarters(runs):

@@ -89,7 +89,7 @@ def solve(
         return _solution(*_inside(problem, method, guess), simulate)
     # The distance bends the feasible set: from the optimum without it the solver needs tens of
     # iterations, from a guess hundreds.
-    first = _solve_meshes(problem, method, guess)
+    first = _solve_meshes(problem, _on_one_mesh(method), guess)
     free = _solution(problem, first, simulate=False)
     if not free.solved:
         return _solution(problem, first, simulate)
@@ -108,12 +108,17 @@ def _inside(
     steps = max(1, int(np.ceil(np.log(farthest) / np.log(_TIGHTER))))
     for step in range(1, steps):
         looser = _within(problem, farthest ** (1 - step / steps))
-        done = _solve_meshes(looser, method, guess).after(done)
+        done = _solve_meshes(looser, _on_one_mesh(method), guess).after(done)
         if done.outcome.ending == "interrupted":
             return looser, done
         guess = _solution(looser, done, simulate=False)
     inside = _within(problem, 1.0)
     return inside, _solve_meshes(inside, method, guess).after(done)
+
+
+def _on_one_mesh(method: Method) -> Method:
+    """The method for what is solved on the way: only the last mesh is worth refining."""
+    return replace(method, refine=None) if isinstance(method, DirectTranscription) else method
 
 
 def _within(problem: OptimalControlProblem, limit: float) -> OptimalControlProblem:
