@@ -18,7 +18,7 @@ import numpy as np
 
 import dfsm
 from benchmarks.accuracy import demo
-from benchmarks.rollouts import STATES, errors, low_passed, recorded, uncorrected
+from benchmarks.rollouts import STATES, errors, low_passed, recorded
 from dfsm.types import Array
 
 CORRELATIONS = (0.0, 0.8)
@@ -40,7 +40,7 @@ def run() -> dict[str, Any]:
         warnings.simplefilter("ignore", dfsm.DfsmWarning)
         for correlation in CORRELATIONS:
             refinement = replace(turbine.REFINEMENT, correlation=correlation)
-            model = dfsm.fit(training, uncorrected(turbine), refinement).model
+            model = dfsm.fit(training, turbine.refined_settings(), refinement).model
             found[str(correlation)] = {
                 "closed loop": errors([model], tests),
                 "perturbed": errors([model], perturbed),

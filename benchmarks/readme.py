@@ -213,17 +213,16 @@ def braking_table(figures: Mapping[str, Any]) -> list[str]:
 
 def matched_table(figures: Mapping[str, Any]) -> list[str]:
     """Errors of rollouts, and of differences between rollouts under the same wind."""
-    heads = " | ".join(f"speed's difference, {name}" for name in figures["pairs"])
     lines = [
         "| correlation of errors | pitch | pitch rate | rotor speed | perturbed: pitch, speed "
-        f"| {heads} |",
-        "|---|---|---|---|---|" + "---|" * len(figures["pairs"]),
+        f"| difference of the speed: {', '.join(figures['pairs'])} |",
+        "|---|---|---|---|---|---|",
     ]
     for name, found in figures["models"].items():
         closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
         cells = [name, *(_two(v) for v in closed.values())]
         cells.append(", ".join(_two(other[c]) for c in ("PtfmPitch", "GenSpeed")))
-        cells += [_two(errors[-1]) for errors in found["differences"]]
+        cells.append(", ".join(_two(errors[-1]) for errors in found["differences"]))
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
