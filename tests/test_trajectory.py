@@ -301,8 +301,11 @@ def test_runs_that_share_channels_stay_on_one_side():
         assert not train & test
         assert ("a" in train) == ("b" in train)
     same = Dataset(r for r in data if r.name in "ab")
-    with pytest.raises(DfsmError, match="all runs have the same wind, so none can be held out"):
-        same.split(together=["wind"])
+    most = Dataset(r for r in data if r.name in "abc")
+    for seed in range(10):
+        assert [r.name for r in most.split(0.25, seed, together=["wind"])[1]] == ["c"]
+    # Where nothing else can be held out, other controls still tell something.
+    assert [len(part) for part in same.split(together=["wind"])] == [1, 1]
 
 
 def test_a_dataset_refuses_none_and_twice_and_strangers():

@@ -494,7 +494,8 @@ class Dataset(Sequence[Trajectory]):
         seed
             Seed of the draw.
         together
-            Channels: runs in which they are the same stay on one side, see `matched`.
+            Channels: runs in which they are the same stay on one side, see `matched`, unless that
+            is all runs.
 
         Returns
         -------
@@ -510,18 +511,15 @@ class Dataset(Sequence[Trajectory]):
             raise DfsmError(f"test_fraction is {test_fraction}, expected between 0 and 1")
         if len(self) < 2:
             raise DfsmError("one run cannot be split into training and test: give more runs")
-        together = tuple(together)
         groups = self.matched(together)
-        if len(groups) < 2:
-            raise DfsmError(
-                f"all runs have the same {', '.join(together)}, so none can be held out to judge "
-                "what is learned from the others: give runs with other disturbances, too"
-            )
+        if len(groups) == 1:
+            groups = self.matched(())
         n_test = min(len(self) - 1, max(1, round(test_fraction * len(self))))
+        # A large group must not leave next to nothing to train with.
+        most = max(n_test, len(self) // 2)
         test: set[int] = set()
-        # One group is always left to train with.
-        for k in np.random.default_rng(seed).permutation(len(groups))[:-1]:
-            if len(test) < n_test:
+        for k in np.random.default_rng(seed).permutation(len(groups)):
+            if len(test) < n_test and len(test) + len(groups[k]) <= most:
                 test.update(groups[k])
         return (
             Dataset(r for i, r in enumerate(self.runs) if i not in test),
