@@ -105,6 +105,31 @@ def test_every_schedule_point_is_made_stable() -> None:
     assert all(max(e) <= -0.05 for e in eigenvalues(stable))
 
 
+def test_coefficients_that_are_known_stay() -> None:
+    inputs, targets = samples()
+    known = {(0, 2): -1.1, (1, 4): 0.2, (0, 0): 0.5}
+    plain = fit_linear([(inputs, targets)], NAMES, LTI(), known=known)
+    assert max(eigenvalues(plain)[0]) > 0
+    stable, _ = stabilise(plain, COLUMNS, KNOWN, 0.05, affine=True)
+    assert max(eigenvalues(stable)[0]) <= -0.05
+    L = np.asarray(stable.model.coefficients[0])
+    for place, value in known.items():
+        assert L[place] == value
+    assert stable.residual_rms == pytest.approx(residuals(stable, inputs, targets), rel=1e-9)
+    # The rest is fitted to what the state matrix and the known ones leave: optimal in each row.
+    left = targets - inputs @ L.T - np.asarray(stable.model.offsets[0])
+    assert np.abs(left.mean(axis=0)).max() < 1e-9
+    assert np.abs(inputs[:, 1] @ left).max() < 1e-6 * len(inputs)
+
+
+def test_a_growth_that_is_known_cannot_be_removed() -> None:
+    inputs, targets = samples()
+    known = {(row, column): 0.1 for row in range(2) for column in range(2, 6)}
+    plain = fit_linear([(inputs, targets)], NAMES, LTI(), known=known)
+    with pytest.raises(DfsmError, match="no stable linear fit was found"):
+        stabilise(plain, COLUMNS, KNOWN, 0.05, affine=True)
+
+
 @pytest.mark.parametrize("margin", [0.0, -1.0])
 def test_a_margin_must_be_positive(margin: float) -> None:
     inputs, targets = samples()

@@ -198,7 +198,7 @@ def _given(
     s = samples.signals
     rates = kinematic_rows(choices.states)
     rows = {spec.name: rates.get(i, i) for i, spec in enumerate(choices.states)}
-    inputs = [c.name for c in s.inputs[: len(s.driving)]]
+    inputs = [c.name for c in s.inputs]
     found = {}
     for state, coefficients in choices.linear.known.items():
         if state not in rows:
@@ -208,7 +208,7 @@ def _given(
         for name, value in coefficients.items():
             if name not in inputs:
                 raise DfsmError(
-                    f"linear.known.{state} names '{name}', which is no control or disturbance; "
+                    f"linear.known.{state} names '{name}', which is no input of the model; "
                     + near_matches(name, inputs)
                 )
             found[list(fitted).index(rows[state]), inputs.index(name)] = float(value)

@@ -43,10 +43,10 @@ class LTI:
         If set, eigenvalues of A with a real part above ``-margin`` (1/s) are moved there, see
         `stabilise`. Never for a system that is truly unstable.
     known
-        Coefficients that physics gives, by state and by control or disturbance, in the units of
-        the channels: ``{"GenSpeed": {"GenTq": -2.997e-5}}`` says that 1 kN m slows the rotor by
-        2.997e-5 rpm/s. They enter the highest derivative of the state and are never changed; what
-        corrects the derivatives does not see these inputs.
+        Coefficients that physics gives, by state and by input, in the units of the channels:
+        ``{"GenSpeed": {"GenTq": -2.997e-5}}`` says that 1 kN m slows the rotor by 2.997e-5 rpm/s.
+        They enter the highest derivative of the state and are never changed, not for a margin
+        either; what corrects the derivatives does not see these inputs.
     """
 
     kind: Literal["LTI"] = "LTI"

@@ -99,6 +99,8 @@ class RefineSettings:
         require(self.step > 0, "refine.step", self.step, "more than 0 s")
         even = self.latents >= 0 and self.latents % 2 == 0
         require(even, "refine.latents", self.latents, "an even number: they come in pairs")
+        some = self.latent_inputs is None or len(self.latent_inputs) > 0
+        require(some, "refine.latent_inputs", self.latent_inputs, "at least one name, or null")
         require(self.network >= 0, "refine.network", self.network, "a number of units, or 0")
         require(self.decay >= 0, "refine.decay", self.decay, "0 or more")
         require(self.iterations >= 1, "refine.iterations", self.iterations, "at least 1")

@@ -122,7 +122,12 @@ def _stable_points(
     """Every schedule point left of a margin of its own, and the points that had to be moved."""
     n = columns.stop - columns.start
     rows = [i for i in range(n) if i not in known]
-    held = [*range(columns.start, columns.stop), *fit.constant]
+    states = range(columns.start, columns.stop)
+    held = [*states, *(c for c in fit.constant if c not in states)]
+    free = np.ones((len(rows), n), dtype=bool)
+    for row, column in fit.model.known:
+        if column in states:
+            free[row, column - columns.start] = False
     coefficients = np.array(fit.model.coefficients)
     offsets = np.array(fit.model.offsets)
     variance = np.zeros((len(offsets), offsets.shape[1]))
@@ -135,23 +140,28 @@ def _stable_points(
             continue
         moved.append(float(fit.model.grid[k]))
         metric = equations.partial_covariance(columns, affine)
-        fixed[:, :n] += _change(A, rows, metric, variance[k], margin)
+        fixed[:, :n] += _change(A, rows, metric, variance[k], margin, free)
         coefficients[k], offsets[k], variance[k] = equations.complete(held, fixed, affine)
     share = fit.samples / fit.samples.sum()
     model = replace(fit.model, coefficients=jnp.asarray(coefficients), offsets=jnp.asarray(offsets))
     return replace(fit, model=model, residual_rms=np.sqrt(share @ variance)), moved
 
 
-def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: float) -> Array:
+def _change(
+    A: Array, rows: list[int], metric: Array, variance: Array, margin: float, free: Array
+) -> Array:
     """Cheapest change of the fitted rows of A that moves all eigenvalues left of ``-margin``.
 
     The cost of a change D is what it adds to the residuals, each relative to its variance:
     ``Σ_r D_r S D_rᵀ / σ_r²``, S being the partial covariance of the states given the other inputs.
+    Entries that are not `free`, by fitted row and state, stay.
     Each step solves for the cheapest D that moves the eigenvalues there to first order,
     dλ = wᴴ dA v with the left and right eigenvectors w and v.
     """
     total = np.zeros((len(rows), len(A)))
-    inverse = np.linalg.inv(metric)
+    inverses = np.zeros((len(rows), *metric.shape))
+    for k, own in enumerate(free):
+        inverses[k][np.ix_(own, own)] = np.linalg.inv(metric[np.ix_(own, own)])
     for _ in range(_STEPS):
         current = A.copy()
         current[rows] += total
@@ -165,7 +175,7 @@ def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: f
             np.real(w[rows].conj()[:, None] * v)
             for w, v in zip(left[active], right[active], strict=True)
         ]
-        cheap = [variance[:, None] * m @ inverse for m in M]
+        cheap = [np.einsum("r,ri,rij->rj", variance, m, inverses) for m in M]
         gram = np.array([[np.sum(a * b) for b in cheap] for a in M])
         weights = np.linalg.lstsq(gram, wanted, rcond=None)[0]
         step = sum(w * c for w, c in zip(weights, cheap, strict=True))
@@ -173,8 +183,8 @@ def _change(A: Array, rows: list[int], metric: Array, variance: Array, margin: f
         size, most = np.linalg.norm(step), 0.2 * (np.linalg.norm(A[rows]) + margin)
         total = total + (step if size <= most else step * most / size)
     raise DfsmError(
-        "no stable linear fit was found near the least-squares one: leave linear.margin out, or "
-        "look at the eigenvalues and choose other states"
+        "no stable linear fit was found near the least-squares one: make linear.margin smaller, "
+        "leave it out, or look at the eigenvalues and choose other states or linear.known"
     )
 
 
