@@ -244,9 +244,11 @@ def test_a_nonlinear_model_beside_it_has_none(runs, tmp_path):
     assert not again["nonlinear-only"].signals.latents
 
 
-def test_an_odd_number_is_refused():
+def test_an_odd_number_or_nothing_to_drive_them_is_refused():
     with pytest.raises(DfsmError, match=r"refine\.latents is 3, expected an even number"):
         replace(REFINEMENT, latents=3)
+    with pytest.raises(DfsmError, match=r"refine\.latent_inputs is .*, expected at least one name"):
+        replace(REFINEMENT, latent_inputs=())
 
 
 def test_constant_coefficients(runs):
@@ -262,19 +264,41 @@ def test_constant_coefficients(runs):
         fit(runs, replace(choices, linear=LPV(schedule="w", constant=("torque",))))
 
 
+def test_staying_inside_does_not_bind_what_only_disturbances_drive(runs, plain):
+    """Unusual wind takes latent states beyond their training range; nobody can help it."""
+    choices = replace(REFINEMENT, latent_inputs=("w",), windows=(5.0,), iterations=2)
+    model = refine(plain, runs, choices, start=START).model
+    run = driven(98)
+    values = run.values.copy()
+    values[:, run.names.index("w")] *= 1.6
+    wild = replace(run, values=values)
+    path = latent_path(model, wild)[TIME >= START]
+    low, high = (np.asarray(a)[-2:] for a in (model.region.low, model.region.high))
+    assert ((path < low) | (path > high)).any()
+    problem = OptimalControlProblem(
+        model=model,
+        horizon=(START, 50.0),
+        cost=lambda s: (s.x.q - 0.1) ** 2,
+        disturbances=wild,
+    )
+    method = DirectTranscription(mesh=100, refine=None, stay_inside=True)
+    assert solve(problem, method, simulate=False).solved
+
+
 @pytest.mark.parametrize("linear", [LTI(), LPV(schedule="w", points=3)])
 def test_known_coefficients(runs, linear, tmp_path):
-    linear = replace(linear, known={"q": {"u": 0.125}}, margin=0.05)
+    linear = replace(linear, known={"q": {"u": 0.125, "q": -0.4}}, margin=0.05)
     choices = replace(SETTINGS, linear=linear)
     brief = replace(REFINEMENT, windows=(5.0,), iterations=2)
     for refinement in (None, brief):
         model = fit(runs, choices, refinement).model
         L = np.asarray(model.f.coefficients)
         assert (L[:, 0, 0] == 0.125).all()
+        assert (L[:, 0, 2] == -0.4).all()
         assert model.g is not None
         assert not (np.asarray(model.g.coefficients)[:, 0, 0] == 0.125).any()
         save(model, tmp_path / "model")
-        assert load(tmp_path / "model").f.known == ((0, 0),)
+        assert load(tmp_path / "model").f.known == ((0, 0), (0, 2))
 
 
 def test_the_others_are_fitted_to_what_known_coefficients_leave():
@@ -332,7 +356,7 @@ def assert_effect(model, expected):
     ("known", "said"),
     [
         ({"speed": {"u": 1.0}}, r"linear\.known names 'speed', which is not a state; "),
-        ({"q": {"q": 1.0}}, r"linear\.known\.q names 'q', which is no control or disturbance; "),
+        ({"q": {"v": 1.0}}, r"linear\.known\.q names 'v', which is no input of the model; "),
     ],
 )
 def test_known_coefficients_of_what_there_is_not(runs, known, said):

@@ -36,7 +36,7 @@ class Layout:
     start
         Where the solve starts; gives the sizes of variables without bounds.
     stay_inside
-        Whether the training range of a surrogate bounds the variables.
+        Whether the training range of a surrogate bounds controls, measured states and parameters.
     """
 
     problem: OptimalControlProblem
@@ -172,7 +172,8 @@ class Layout:
 
     def _inside(self, name: str, low: Array, high: Array) -> tuple[Array, Array]:
         region = self.problem.plant.region
-        if not self.stay_inside or region is None:
+        # Latent states follow from the inputs; where disturbances drive them there is no choice.
+        if not self.stay_inside or region is None or name in self.problem.latents:
             return low, high
         groups = ("controls", "disturbances", "states", "parameters")
         i = [n for g in groups for n in self.problem.plant.names(g)].index(name)

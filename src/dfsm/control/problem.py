@@ -159,10 +159,17 @@ class OptimalControlProblem:
             return run
         return with_computed(run, self.model.signals.hub_height, self.model.signals.features)
 
+    @property
+    def latents(self) -> tuple[str, ...]:
+        """Names of the states that nobody measures."""
+        if not isinstance(self.model, DFSM):
+            return ()
+        return tuple(c.name for c in self.model.signals.latents)
+
     @cached_property
     def latent_starts(self) -> dict[str, list[float | None]]:
         """Latent states at the first time by name, one per scenario; None where that is free."""
-        if not isinstance(self.model, DFSM) or not self.model.signals.latents:
+        if not isinstance(self.model, DFSM) or not self.latents:
             return {}
         driving = self.model.signals.driving
         known = [
@@ -171,10 +178,9 @@ class OptimalControlProblem:
             else None
             for run in self.scenarios
         ]
-        names = [c.name for c in self.model.signals.latents]
         return {
             name: [None if values is None else float(values[k]) for values in known]
-            for k, name in enumerate(names)
+            for k, name in enumerate(self.latents)
             if name not in self.initial
         }
 

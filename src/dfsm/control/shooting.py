@@ -41,7 +41,7 @@ class MultipleShooting:
     steps
         RK4 steps in every piece.
     stay_inside
-        Keep states, controls and free parameters inside the training range of a surrogate, and
+        Keep measured states, controls and free parameters inside a surrogate's training range, and
         their combinations near what occurred there, see `Region.distance_chosen`.
     tolerance
         Of the scaled optimality conditions.
