@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.control.functions import Functions, common_of, functions_of
+from dfsm.control.functions import common_of, functions_of
 from dfsm.control.grid import Grid
 from dfsm.control.guess import Start
 from dfsm.control.problem import OptimalControlProblem
@@ -48,15 +49,15 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
     size = np.abs(X).max(axis=0)
     size = np.where(size > 0, size, 1.0)
     shared = [*start.p, *([start.stop] if problem.free_time is not None else [])]
-    common = common_of(problem) | _table(problem, scenario)
+    p, _ = functions.unpack(jnp.asarray(shared), common_of(problem))
     found = _integrate(
-        functions,
+        functions.plant.derivative,
         _pieces(grid, U),
         X[0],
         size,
-        np.asarray(shared),
-        common,
-        duration,
+        p,
+        _table(problem, scenario),
+        (problem.start, duration),
         grid.scheme.points,
     )
     states = np.concatenate([X[:1], np.asarray(found)[: grid.intervals].reshape(-1, X.shape[1])])
@@ -89,33 +90,35 @@ def _pieces(grid: Grid, U: Array) -> dict[str, Array]:
     }
 
 
-def _table(problem: OptimalControlProblem, scenario: int) -> dict[str, Any]:
+def _table(problem: OptimalControlProblem, scenario: int) -> tuple[Array, Array]:
+    """Times of the disturbances' samples, and these."""
     names, run = problem.plant.names("disturbances"), problem.scenarios[scenario]
     if run is None or not names:
-        return {"w_time": np.zeros(2), "w": np.zeros((2, 0))}
-    return {"w_time": run.time, "w": run.select(names).values}
+        return np.zeros(2), np.zeros((2, 0))
+    return run.time, run.select(names).values
 
 
 @eqx.filter_jit
 def _integrate(
-    functions: Functions,
+    derivative: Callable[..., Any],
     pieces: dict[str, Array],
     x0: Array,
     size: Array,
-    shared: Array,
-    common: dict[str, Any],
-    duration: float,
+    p: jax.Array,
+    disturbances: tuple[Array, Array],
+    horizon: tuple[float, float],
     points: Array,
 ) -> jax.Array:
+    # Of the problem only its model comes in here, so that all problems on one share a compilation.
     import diffrax
 
-    p, _ = functions.unpack(jnp.asarray(shared), common)
+    (begin, duration), (times, values) = horizon, disturbances
 
     def slope(theta: jax.Array, z: jax.Array, piece: dict[str, jax.Array]) -> jax.Array:
         powers = theta ** jnp.arange(len(points))
-        t = common["start"] + (piece["begin"] + theta * piece["length"]) * duration
-        w = jax.vmap(lambda v: jnp.interp(t, common["w_time"], v), 1)(jnp.asarray(common["w"]))
-        f = functions.plant.derivative(z * size, powers @ piece["controls"], w, p)
+        t = begin + (piece["begin"] + theta * piece["length"]) * duration
+        w = jax.vmap(lambda v: jnp.interp(t, times, v), 1)(jnp.asarray(values))
+        f = derivative(z * size, powers @ piece["controls"], w, p)
         return f * piece["length"] * duration / size
 
     def step(z: jax.Array, piece: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
