@@ -4,7 +4,7 @@ Five of the turbine's training runs repeat wind and waves of others with perturb
 do its three perturbed test runs. What a model does not see of the wind is the same in both runs of
 such a pair, so that the difference between them shows what the controls did, and nothing else. The
 demo's refinement is repeated with such runs taken as unrelated, as in the demo, and with errors
-that correlate.
+that correlate. Below rated wind, a model that is told what moves the rotor is measured beside it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Pair = tuple[dfsm.Trajectory, dfsm.Trajectory]
 
 def run() -> dict[str, Any]:
     """Errors of rollouts and of differences, and what differences of records tell by themselves."""
-    turbine, found = demo(), {}
+    turbine, found, models = demo(), {}, {}
     winds = turbine.WINDS["all winds"]
     closed = turbine.runs(winds, range(1, 9))
     training = [*closed, *turbine.perturbed(testing=False)]
@@ -41,14 +41,26 @@ def run() -> dict[str, Any]:
         for correlation in CORRELATIONS:
             refinement = replace(turbine.REFINEMENT, correlation=correlation)
             model = dfsm.fit(training, turbine.refined_settings(), refinement).model
+            models.setdefault("all winds", model)
             found[str(correlation)] = {
                 "closed loop": errors([model], tests),
                 "perturbed": errors([model], perturbed),
                 "differences": [difference_errors(model, pair) for pair in pairs],
             }
+        models["below rated"] = turbine.below_rated()
+    tests = turbine.runs([turbine.BELOW_RATED], range(9, 11))
+    pair = next(pair for pair in pairs if f"_{turbine.BELOW_RATED}mps" in pair[0].name)
+    below = {
+        name: {
+            "closed loop": errors([model], tests),
+            "perturbed": errors([model], pair[1:]),
+            "difference": difference_errors(model, pair),
+        }
+        for name, model in models.items()
+    }
     names = [p.name.removeprefix("iea15_2dof_").removesuffix("_ol") for p in perturbed]
     slopes = [speed_slopes(turbine, pair) for pair in pairs]
-    return {"pairs": names, "models": found, "slopes": slopes}
+    return {"pairs": names, "models": found, "slopes": slopes, "below rated": below}
 
 
 def difference_errors(model: dfsm.DFSM, pair: Pair) -> list[float]:

@@ -242,6 +242,24 @@ def slopes_table(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def below_rated_table(figures: Mapping[str, Any]) -> list[str]:
+    """Errors below rated wind, of a model that is told what moves the rotor and one that is not."""
+    lines = [
+        "| at 6 m/s | controlled: pitch, speed | perturbed: pitch, speed "
+        "| difference of the pair: pitch, speed |",
+        "|---|---|---|---|",
+    ]
+    for name, found in figures["below rated"].items():
+        cells = [
+            ", ".join(_two(found[kind]["filtered"][c]) for c in ("PtfmPitch", "GenSpeed"))
+            for kind in ("closed loop", "perturbed")
+        ]
+        difference = found["difference"]
+        cells.append(f"{_two(difference[0])}, {_two(difference[-1])}")
+        lines.append(f"| model for {name} | {' | '.join(cells)} |")
+    return lines
+
+
 def sweep_table(figures: Mapping[str, Any]) -> list[str]:
     """The sweep of constant winds in one line per figure."""
     found = figures["sweep"]
@@ -408,7 +426,11 @@ ROLLOUT_TABLES = {
     "leak": leak_table,
 }
 LIMITS_TABLES = {"limits": limits_table, "field": field_table, "braking": braking_table}
-MATCHED_TABLES = {"matched": matched_table, "slopes": slopes_table}
+MATCHED_TABLES = {
+    "matched": matched_table,
+    "slopes": slopes_table,
+    "below_rated": below_rated_table,
+}
 CODESIGN_TABLES = {"codesign": codesign_table, "adaptive": adaptive_table}
 # By the part of the figures that each shows.
 CONTROL_TABLES = {

@@ -6,6 +6,7 @@ import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from dfsm.report import write_solution_report
 from dfsm.report.publish import publish
 from dfsm.report.turbine_control import CLAIMS, control_article, trends
 from dfsm.studies.turbine_control import (
+    BEST_COEFFICIENT,
     BLADE,
     MOMENT,
     PITCH,
@@ -116,6 +118,66 @@ def test_staying_inside_keeps_near_the_data_at_a_cost(region: Region, found: Con
     for r, near in ((free, False), (inside, True)):
         far = np.asarray(chosen(r.run.select(names).values)).max()
         assert (far < 1 + 1e-4) == near
+
+
+def test_an_optimum_that_keeps_a_tighter_limit_is_not_sought_again(region: Region):
+    size = ControlStudySize(points=60, pitch_limits=(30.0, 20.0, 5.0), inside=False)
+    results = study([region], size).results
+    assert [r.most_pitch for r in results] == [30.0, 20.0, 5.0] * 2
+    loose, tighter, tight = results[3:]
+    assert tighter.run is loose.run
+    assert tight.run is not loose.run
+    assert tight.run[PITCH].max() <= 5 + 1e-6 < loose.run[PITCH].max() < 20
+    for r in results:
+        assert r.solution.bounds[PITCH][1].max() == r.most_pitch
+
+
+def test_the_best_power_coefficient_is_that_of_steady_wind_or_of_a_training_run(region: Region):
+    assert region.best_coefficient == BEST_COEFFICIENT
+    run = region.training[0]
+    values = run.values.copy()
+    values[:, run.names.index(TORQUE)] *= 2
+    stronger = replace(region, training=[replace(run, values=values), *region.training[1:]])
+    course = run.window(region.start)
+    power = 2e3 * np.mean(course[TORQUE] * course[SPEED]) * np.pi / 30
+    wind = 1.225 / 2 * np.pi * 120**2 * np.mean(course["RotWind"] ** 3)
+    assert stronger.best_coefficient == pytest.approx(power / wind, rel=1e-3)
+    assert stronger.best_coefficient > BEST_COEFFICIENT
+
+
+def test_below_rated_wind_the_model_is_told_what_moves_the_rotor(monkeypatch):
+    data, asked = demo(), []
+    training = data.runs([data.BELOW_RATED], range(1, 3))
+    with monkeypatch.context() as patch:
+        # What it would be fitted to; the refinement takes a minute.
+        patch.setattr(data, "runs", lambda *_: training)
+        patch.setattr(data.dfsm, "fit", lambda *a: asked.extend(a) or SimpleNamespace(model=None))
+        data.below_rated()
+    runs, choices, refinement = asked
+    assert [r.name[-9:] for r in runs] == ["06mps_s01", "06mps_s02", "mps_s01_ol"[-9:]]
+    assert BLADE not in refinement.latent_inputs
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DfsmWarning)
+        model = fit(runs, choices).model
+    names = [c.name for c in model.signals.inputs]
+    row = [c.name for c in model.signals.states].index(SPEED)
+    effects = dict(zip(names, np.asarray(model.f.coefficients)[:, row].T, strict=True))
+    speed, torque, wind = (
+        np.mean([r.window(data.START)[name].mean() for r in training])
+        for name in (SPEED, TORQUE, "RotWind")
+    )
+    J, to_rpm = 318.6e6, 30 / np.pi  # kg m² with the generator
+    known = {
+        TORQUE: -1e3 / J * to_rpm,
+        # d(T/J)/dω = -T/(J ω) at constant power, per rpm.
+        SPEED: -1e3 * torque / (J * speed) * to_rpm,
+        BLADE: 0.0,
+        PITCH: 0.0,
+        # The hub is 150 m up and moves against the wind.
+        f"{PITCH}_dot": -1e3 / J * to_rpm * 3 * torque / wind * np.radians(150),
+    }
+    for name, value in known.items():
+        np.testing.assert_allclose(effects[name], value, rtol=1e-3, atol=1e-15)
 
 
 def test_bounds_that_cannot_be_met_are_named(region: Region):

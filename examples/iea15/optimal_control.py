@@ -2,7 +2,7 @@
 
 Takes the models that `demo.py` saved and maximises the power over 600 s of wind that the fits never
 saw, with the paper's bounds and with those of this turbine, for three limits of the platform pitch.
-Writes a page, its tables as JSON, and figures.
+Below rated wind it fits a model that knows more. Writes a page, its tables as JSON, and figures.
 
     python examples/iea15/optimal_control.py [--models out/] [--output out/] [--quick]
 """
@@ -30,14 +30,15 @@ QUICK, FEW = {"12": range(9, 10)}, ControlStudySize(pitch_limits=(5.0, 7.0))
 
 
 def regions(models: Path, series: Mapping[str, range]) -> list[Region]:
-    """Models and runs of each region; one model for all winds serves them all."""
+    """Models and runs of each region; one model serves all but that below rated wind."""
     everywhere, found = dfsm.load(models / "model_all_winds"), []
     for wind, seeds in series.items():
         own = dfsm.load(models / f"model_{int(wind)}mps")
+        model = demo.below_rated() if wind == demo.BELOW_RATED else everywhere
         speed = float(wind)
         training, tests = demo.runs([wind], range(1, 9)), demo.runs([wind], seeds)
         name = f"{speed:g} m/s"
-        found.append(Region(name, speed, own, everywhere, training, tests, demo.START))
+        found.append(Region(name, speed, own, model, training, tests, demo.START))
     return found
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -28,8 +28,8 @@ from dfsm.types import Array
 # Channels of the turbine, in OpenFAST's words and units: kN m, deg, deg, rpm, m/s, kN, kN m.
 TORQUE, BLADE, PITCH, SPEED, WIND = "GenTq", "BldPitch1", "PtfmPitch", "GenSpeed", "RotWind"
 SHEAR, MOMENT = "TwrBsFxt", "TwrBsMyt"
-# Rotor radius in m, air density in kg/m³ and best power coefficient of the IEA 15 MW turbine
-# (Gaertner et al. 2020).
+# Rotor radius in m, air density in kg/m³ and best power coefficient in steady wind of the IEA 15 MW
+# turbine (Gaertner et al. 2020).
 RADIUS, DENSITY, BEST_COEFFICIENT = 120.0, 1.225, 0.489
 MEGAWATT = np.pi / 30e3  # of kN m × rpm
 _TORQUE_WEIGHT, _BLADE_WEIGHT = 1e-5, 0.5
@@ -149,6 +149,16 @@ class Region:
     tests: Sequence[Trajectory]
     start: float
 
+    @property
+    def best_coefficient(self) -> float:
+        """The best power coefficient that is known of this turbine, of the disk's mean wind.
+
+        In steady wind, or of a training run, which takes more where there is turbulence within the
+        disk.
+        """
+        runs = [run.window(self.start) for run in self.training]
+        return max([BEST_COEFFICIENT, *(mean_power(r) / wind_power(r) for r in runs)])
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -164,6 +174,8 @@ class Result:
         See `Solution`.
     recorded
         The run in closed loop, over the same horizon.
+    available
+        Mean aerodynamic power in MW of the disk's mean wind at the best power coefficient known.
     outside
         Share of the nodes outside the training range, by input that leaves it.
     """
@@ -175,6 +187,7 @@ class Result:
     inside: bool
     solution: Solution
     recorded: Trajectory
+    available: float
     outside: Mapping[str, float]
 
     @property
@@ -201,12 +214,6 @@ class Result:
     def recorded_power(self) -> float:
         """Mean electrical power in MW of the recorded run, at the same efficiency."""
         return self.case.efficiency * mean_power(self.recorded)
-
-    @property
-    def available(self) -> float:
-        """Mean aerodynamic power in MW at the best power coefficient, of the disk's mean wind."""
-        area, wind = np.pi * RADIUS**2, self.recorded
-        return BEST_COEFFICIENT * DENSITY / 2 * area * mean(wind, wind[WIND] ** 3) / 1e6
 
     @property
     def blade_activity(self) -> float:
@@ -287,6 +294,11 @@ def mean_power(run: Trajectory) -> float:
     return mean(run, run[TORQUE] * run[SPEED]) * MEGAWATT
 
 
+def wind_power(run: Trajectory) -> float:
+    """Mean power in MW of the disk's mean wind: of ρ/2 π R² w³."""
+    return DENSITY / 2 * np.pi * RADIUS**2 * mean(run, run[WIND] ** 3) / 1e6
+
+
 def problem(
     model: DFSM,
     wind: Trajectory,
@@ -340,7 +352,7 @@ def optimise(
     case: Case,
     most_pitch: float,
     size: ControlStudySize,
-    left: Result | None = None,
+    near: Result | None = None,
 ) -> Result:
     """Solve the problem for one wind series and one limit of the platform pitch.
 
@@ -354,11 +366,11 @@ def optimise(
         Bounds.
     size
         Nodes, horizon and tolerance.
-    left
-        The result whose solution left the training data: stay inside now, and start from it.
+    near
+        Stay inside the training data, and start from this result.
     """
-    inside = left is not None
-    guess = left.solution if left is not None and left.solution.solved else None
+    inside = near is not None
+    guess = near.solution if near is not None and near.solution.solved else None
     method = DirectTranscription(
         scheme="trapezoidal",
         mesh=size.points - 1,
@@ -373,7 +385,17 @@ def optimise(
     beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
     outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
     recorded = wind.window(run.time[0], run.time[-1])
-    return Result(region.name, wind.name, case, most_pitch, inside, solution, recorded, outside)
+    return Result(
+        region=region.name,
+        series=wind.name,
+        case=case,
+        most_pitch=most_pitch,
+        inside=inside,
+        solution=solution,
+        recorded=recorded,
+        available=region.best_coefficient * wind_power(recorded),
+        outside=outside,
+    )
 
 
 def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> ControlStudy:
@@ -391,19 +413,48 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
     for region in regions:
         own = turbine_case(region)
         for wind in region.tests:
-            paper, free = (
-                [optimise(region, wind, case, p, size) for p in size.pitch_limits]
-                for case in (PAPER, own)
-            )
+            paper, free = (_limits(region, wind, case, size) for case in (PAPER, own))
             results += [*paper, *free]
             if size.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
-                results += [optimise(region, wind, own, r.most_pitch, size, r) for r in free]
+                results += _limits(region, wind, own, size, free)
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
         for key, model in models.items():
             gains[f"{region.name}, case {key}"] = steady_gains(model, region.wind)
     return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
+
+
+def _limits(
+    region: Region,
+    wind: Trajectory,
+    case: Case,
+    size: ControlStudySize,
+    near: Sequence[Result] = (),
+) -> list[Result]:
+    """Results for all limits of the platform pitch, as they stand in `size`.
+
+    Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too. Inside the
+    training data each is solved from its counterpart in `near`.
+    """
+    starts = {r.most_pitch: r for r in near}
+    found: dict[float, Result] = {}
+    last = None
+    for limit in sorted(size.pitch_limits, reverse=True):
+        if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
+            last = _tighter(last, limit)
+        else:
+            last = optimise(region, wind, case, limit, size, starts.get(limit))
+        found[limit] = last
+    return [found[limit] for limit in size.pitch_limits]
+
+
+def _tighter(found: Result, limit: float) -> Result:
+    """The same result as that of a limit which it keeps."""
+    solution = found.solution
+    low, high = solution.bounds[PITCH]
+    bounds = {**solution.bounds, PITCH: np.stack([low, np.full_like(high, limit)])}
+    return replace(found, most_pitch=limit, solution=replace(solution, bounds=bounds))
 
 
 def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:
