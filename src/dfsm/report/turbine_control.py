@@ -19,6 +19,7 @@ from dfsm.studies.turbine_control import (
     ControlStudy,
     Result,
     mean_power,
+    wind_power,
 )
 
 KEY = "turbine_control"
@@ -185,7 +186,8 @@ def _series_section(name: str, found: Sequence[Result]) -> Section:
             "samples of the wind. "
             "Where an optimum keeps a tighter Θp,max by itself, it stands there, too. "
             f"Recorded in closed loop: {cell_text(mean_power(first.recorded))} MW of mechanical "
-            f"power; available to a rotor at its best: {cell_text(first.available)} MW. "
+            f"power; available to a rotor at its best: {cell_text(first.available)} MW, a power "
+            f"coefficient of {cell_text(first.available / wind_power(first.recorded))}. "
             f"Case b: {loads} (kN, kN m)."
         ),
         digits=4,
