@@ -453,7 +453,7 @@ def _tighter(found: Result, limit: float) -> Result:
     """The same result as that of a limit which it keeps."""
     solution = found.solution
     low, high = solution.bounds[PITCH]
-    bounds = {**solution.bounds, PITCH: np.stack([low, np.full_like(high, limit)])}
+    bounds = {**solution.bounds, PITCH: np.stack([low, np.minimum(high, limit)])}
     return replace(found, most_pitch=limit, solution=replace(solution, bounds=bounds))
 
 
