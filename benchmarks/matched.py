@@ -47,7 +47,7 @@ def run() -> dict[str, Any]:
                 "perturbed": errors([model], perturbed),
                 "differences": [difference_errors(model, pair) for pair in pairs],
             }
-        models["below rated"] = turbine.below_rated()
+        models["wind below rated"] = turbine.below_rated()
     tests = turbine.runs([turbine.BELOW_RATED], range(9, 11))
     pair = next(pair for pair in pairs if f"_{turbine.BELOW_RATED}mps" in pair[0].name)
     below = {
