@@ -65,6 +65,19 @@ class ChannelError:
     nrmse: float
     maximum: float
 
+    @classmethod
+    def of(cls, simulated: Array, recorded: Array) -> ChannelError:
+        """Compare samples at the same times."""
+        difference, size = simulated - recorded, spread(recorded)
+        rmse = float(np.sqrt(np.mean(difference**2)))
+        return cls(rmse, rmse / size if size else float("inf"), float(np.abs(difference).max()))
+
+
+def spread(values: Array) -> float:
+    """Standard deviation; 0 for a constant, whose samples differ by rounding errors only."""
+    std = float(values.std())
+    return std if std > 1e-12 * np.abs(values).max() else 0.0
+
 
 @dataclass(frozen=True)
 class ModelRun:

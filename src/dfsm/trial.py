@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import dfsm
+from dfsm.comparison import ChannelError, spread
 from dfsm.derivatives import differentiate
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.files import json_value
@@ -146,18 +147,14 @@ def _judge(model: DFSM, course: Course, choices: FitSettings) -> Outcome:
     simulate(model, course.validation, **window)  # compiles
     found = simulate(model, course.validation, **window)
     diverged = sum(s.status is not Status.COMPLETED for s in found)
-    nrmse: dict[str, float | None] = {}
-    for name in (c.name for c in model.signals.observed):
-        if name in course.references[0]:
-            errors = (
-                []
-                if diverged
-                else [
-                    float(np.sqrt(np.mean((s.trajectory[name] - r[name]) ** 2)) / r[name].std())
-                    for s, r in zip(found, course.references, strict=True)
-                ]
-            )
-            nrmse[name] = None if diverged else float(np.mean(errors))
+    pairs = list(zip((s.trajectory for s in found), course.references, strict=True))
+    measured = [c.name for c in model.signals.observed if c.name in course.references[0]]
+    nrmse = {
+        n: None
+        if diverged
+        else float(np.mean([ChannelError.of(x[n], r[n]).nrmse for x, r in pairs]))
+        for n in measured
+    }
     return Outcome(
         nrmse=nrmse,
         diverged=diverged,
@@ -173,8 +170,7 @@ def _reference(run: Trajectory, choices: FitSettings) -> dict[str, Array]:
     extracted = found.trajectory.window(choices.start, choices.stop)
     values = {n: recorded[n] if n in recorded else extracted[n] for n in found.names}
     for name, value in values.items():
-        # A constant has a spread of rounding errors.
-        if value.std() <= 1e-12 * np.abs(value).max():
+        if not spread(value):
             raise DfsmError(
                 f"state '{name}' is constant in the validation run {run.where}, so an error has "
                 "no scale there: choose other runs with compare.validation"

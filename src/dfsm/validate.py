@@ -149,7 +149,7 @@ def _compare(
         band, coverage = None, {}
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
-                errors[c.name] = _error(simulation.trajectory[c.name], recorded[c.name])
+                errors[c.name] = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
             statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
@@ -195,18 +195,6 @@ def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Traje
         name=run.name,
         source=run.source,
         wall_time=run.wall_time,
-    )
-
-
-def _error(simulated: Array, recorded: Array) -> ChannelError:
-    difference = simulated - recorded
-    rmse = float(np.sqrt(np.mean(difference**2)))
-    spread = float(recorded.std())
-    return ChannelError(
-        rmse=rmse,
-        # A constant has a spread of rounding errors.
-        nrmse=rmse / spread if spread > 1e-12 * np.abs(recorded).max() else float("inf"),
-        maximum=float(np.abs(difference).max()),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.comparison import ChannelError
 from dfsm.control.solution import RATE, Solution
 from dfsm.errors import DfsmError, missing, printable
 from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
@@ -209,16 +210,14 @@ def _prediction(solution: Solution, scenario: int, time: Array) -> Trajectory:
 
 
 def _channel(predicted: Trajectory, actual: Trajectory, name: str) -> ChannelCheck:
-    channel, difference = predicted.channel(name), predicted[name] - actual[name]
-    rmse, spread = float(np.sqrt(np.mean(difference**2))), float(actual[name].std())
+    channel, error = predicted.channel(name), ChannelError.of(predicted[name], actual[name])
     is_load = channel.role == "output"
     return ChannelCheck(
         unit=channel.unit,
         role=channel.role,
-        rmse=rmse,
-        largest=float(np.abs(difference).max()),
-        # A constant has a spread of rounding errors.
-        nrmse=rmse / spread if spread > 1e-12 * np.abs(actual[name]).max() else np.inf,
+        rmse=error.rmse,
+        largest=error.maximum,
+        nrmse=error.nrmse,
         predicted=_figures(predicted, name, is_load),
         actual=_figures(actual, name, is_load),
     )
