@@ -125,14 +125,14 @@ def below_rated() -> dfsm.DFSM:
     Runs do not tell it: below rated wind the controls follow wind that no model sees.
     """
     training = runs([BELOW_RATED], range(1, 9))
-    shaken = [run for run in perturbed(False) if f"_{BELOW_RATED}mps" in run.name]
+    open_loop = [run for run in perturbed(False) if f"_{BELOW_RATED}mps" in run.name]
     known = {"GenSpeed": motions_below_rated(training)}
     # The speed settles at 0.039 1/s, as given: a margin beyond that cannot be had.
     linear = dfsm.LPV(schedule="RotWind", points=3, known=known, margin=0.03)
     driving = tuple(n for n in REFINEMENT.latent_inputs or () if n != "BldPitch1")
     refinement = replace(REFINEMENT, latent_inputs=driving)
     choices = replace(refined_settings(), linear=linear)
-    return dfsm.fit([*training, *shaken], choices, refinement).model
+    return dfsm.fit([*training, *open_loop], choices, refinement).model
 
 
 def study(

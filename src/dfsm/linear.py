@@ -73,7 +73,7 @@ class LPV:
     affine
         Fit an offset in every window.
     margin
-        As for `LTI`, at every schedule point.
+        As for `LTI`, at every schedule point; there, constant coefficients of states may move, too.
     """
 
     kind: Literal["LPV"] = "LPV"

@@ -57,7 +57,7 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
         size,
         p,
         _table(problem, scenario),
-        (problem.start, duration),
+        np.array([problem.start, duration]),
         grid.scheme.points,
     )
     states = np.concatenate([X[:1], np.asarray(found)[: grid.intervals].reshape(-1, X.shape[1])])
@@ -106,13 +106,14 @@ def _integrate(
     size: Array,
     p: jax.Array,
     disturbances: tuple[Array, Array],
-    horizon: tuple[float, float],
+    horizon: Array,
     points: Array,
 ) -> jax.Array:
     # Of the problem only its model comes in here, so that all problems on one share a compilation.
     import diffrax
 
-    (begin, duration), (times, values) = horizon, disturbances
+    begin, duration = jnp.asarray(horizon)
+    times, values = disturbances
 
     def slope(theta: jax.Array, z: jax.Array, piece: dict[str, jax.Array]) -> jax.Array:
         powers = theta ** jnp.arange(len(points))
