@@ -98,8 +98,8 @@ def trends_section(study: ControlStudy) -> Section:
         note=(
             "Θp peaks: mean wind while Θp is among its highest 5 %, with the highest Θp,max; near "
             "is within 1 m/s. β: its mean; its rate stands in the tables below. No change: "
-            "the optimum does not depend on Θp,max. Power: electrical. Available: mean of "
-            "c ρ/2 π R² w³ with the mean wind w over the disk and the best power coefficient c known, "
+            "the optimum does not depend on Θp,max. Power: electrical. Available: mean of c ρ/2 π "
+            "R² w³ with the mean wind w over the disk and the best known power coefficient c, "
             f"{BEST_COEFFICIENT} in steady wind or what a training run of the region took, if that "
             "is more: the disk's mean leaves out the turbulence within the disk."
         ),
