@@ -41,26 +41,27 @@ def run() -> dict[str, Any]:
         for correlation in CORRELATIONS:
             refinement = replace(turbine.REFINEMENT, correlation=correlation)
             model = dfsm.fit(training, turbine.refined_settings(), refinement).model
-            models.setdefault("all winds", model)
-            found[str(correlation)] = {
-                "closed loop": errors([model], tests),
-                "perturbed": errors([model], perturbed),
-                "differences": [difference_errors(model, pair) for pair in pairs],
-            }
+            found[str(correlation)] = judged(model, tests, pairs)
+            if not correlation:
+                models["all winds"] = model
         models["wind below rated"] = turbine.below_rated()
     tests = turbine.runs([turbine.BELOW_RATED], range(9, 11))
     pair = next(pair for pair in pairs if f"_{turbine.BELOW_RATED}mps" in pair[0].name)
-    below = {
-        name: {
-            "closed loop": errors([model], tests),
-            "perturbed": errors([model], pair[1:]),
-            "difference": difference_errors(model, pair),
-        }
-        for name, model in models.items()
-    }
+    below = {name: judged(model, tests, [pair]) for name, model in models.items()}
     names = [p.name.removeprefix("iea15_2dof_").removesuffix("_ol") for p in perturbed]
     slopes = [speed_slopes(turbine, pair) for pair in pairs]
     return {"pairs": names, "models": found, "slopes": slopes, "below rated": below}
+
+
+def judged(
+    model: dfsm.DFSM, tests: Sequence[dfsm.Trajectory], pairs: Sequence[Pair]
+) -> dict[str, Any]:
+    """Errors on controlled runs, on the perturbed ones of pairs, and of the pairs' differences."""
+    return {
+        "closed loop": errors([model], tests),
+        "perturbed": errors([model], [perturbed for _, perturbed in pairs]),
+        "differences": [difference_errors(model, pair) for pair in pairs],
+    }
 
 
 def difference_errors(model: dfsm.DFSM, pair: Pair) -> list[float]:

@@ -143,6 +143,10 @@ def _two(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
+def _pitch_and_speed(errors: Mapping[str, float | None]) -> str:
+    return ", ".join(_two(errors[c]) for c in ("PtfmPitch", "GenSpeed"))
+
+
 def loads_table(figures: Mapping[str, Any]) -> list[str]:
     """Tower-base loads of the last model, run by run."""
     lines = [
@@ -183,7 +187,7 @@ def limits_table(figures: Mapping[str, Any]) -> list[str]:
         closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
         pair = ", ".join(f"{found[k] ** 0.5:.3f}" for k in ("training", "validation"))
         cells = [str(found["runs"]), pair, *(_two(v) for v in closed.values())]
-        cells.append(", ".join(_two(other[c]) for c in ("PtfmPitch", "GenSpeed")))
+        cells.append(_pitch_and_speed(other))
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
 
@@ -221,7 +225,7 @@ def matched_table(figures: Mapping[str, Any]) -> list[str]:
     for name, found in figures["models"].items():
         closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
         cells = [name, *(_two(v) for v in closed.values())]
-        cells.append(", ".join(_two(other[c]) for c in ("PtfmPitch", "GenSpeed")))
+        cells.append(_pitch_and_speed(other))
         cells.append(", ".join(_two(errors[-1]) for errors in found["differences"]))
         lines.append(f"| {' | '.join(cells)} |")
     return lines
@@ -250,11 +254,8 @@ def below_rated_table(figures: Mapping[str, Any]) -> list[str]:
         "|---|---|---|---|",
     ]
     for name, found in figures["below rated"].items():
-        cells = [
-            ", ".join(_two(found[kind]["filtered"][c]) for c in ("PtfmPitch", "GenSpeed"))
-            for kind in ("closed loop", "perturbed")
-        ]
-        difference = found["difference"]
+        cells = [_pitch_and_speed(found[k]["filtered"]) for k in ("closed loop", "perturbed")]
+        difference = found["differences"][0]
         cells.append(f"{_two(difference[0])}, {_two(difference[-1])}")
         lines.append(f"| model for {name} | {' | '.join(cells)} |")
     return lines

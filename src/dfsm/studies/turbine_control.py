@@ -13,7 +13,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -149,7 +149,7 @@ class Region:
     tests: Sequence[Trajectory]
     start: float
 
-    @property
+    @cached_property
     def best_coefficient(self) -> float:
         """The best power coefficient that is known of this turbine, of the disk's mean wind.
 
@@ -209,11 +209,6 @@ class Result:
     def power_course(self) -> Array:
         """Electrical power in MW at the nodes."""
         return self.case.efficiency * self.run[TORQUE] * self.run[SPEED] * MEGAWATT
-
-    @property
-    def recorded_power(self) -> float:
-        """Mean electrical power in MW of the recorded run, at the same efficiency."""
-        return self.case.efficiency * mean_power(self.recorded)
 
     @property
     def blade_activity(self) -> float:
