@@ -15,6 +15,9 @@ from dfsm.sampling import Method, Subsample
 from dfsm.settings import require, settings
 from dfsm.types import Array
 
+# Eigenvalues of a kernel matrix below this share of the largest are rounding.
+_LEAST = 1e-9
+
 
 @settings
 class GP:
@@ -80,11 +83,16 @@ class _Kernel:
 
     def sparse_weights(self, data: TrainingSet, noise: float) -> Array:
         """Weights of the units from all samples: (K_mn K_nm + noise K_mm)⁻¹ K_mn y."""
-        n, K = len(self.points), self.gram
+        n = len(self.points)
         products = unit_sums(data.z, data.targets, self.points, self.width).products
-        A = self.signal**2 * products[:n, :n] + noise * K
-        right = self.signal * products[:n, n:]
-        return self.signal * np.linalg.solve(A + 1e-10 * mean_diagonal(A) * np.eye(n), right)
+        # In the eigenbasis of the kernel, scaled to 1: long length scales make K_mm nearly
+        # singular, and what varies slowly would be lost in its square.
+        values, vectors = np.linalg.eigh(self.gram)
+        known = values > _LEAST * values[-1]
+        basis = vectors[:, known] / np.sqrt(values[known])
+        A = basis.T @ (self.signal**2 * products[:n, :n]) @ basis
+        right = basis.T @ (self.signal * products[:n, n:])
+        return self.signal * basis @ np.linalg.solve(A + noise * np.eye(len(A)), right)
 
     def predictor(self, data: TrainingSet, noise: float) -> Callable[[Array], Array]:
         weights = self.sparse_weights(data, noise)

@@ -42,9 +42,9 @@ class RBF:
         Width of the units relative to the typical distance between two samples; None chooses it
         by cross-validation over runs.
     directions
-        ``"per_input"`` makes the units as long in the direction of each input as a Gaussian
-        process through the cluster means finds the function to be; ``"equal"`` as long in all
-        standardised inputs, as in the paper.
+        ``"equal"`` makes the units as long in all standardised inputs, as in the paper;
+        ``"per_input"`` as long in the direction of each as a Gaussian process through the cluster
+        means finds the function to be, where that is better on runs left out.
     """
 
     kind: Literal["rbf"] = "rbf"
@@ -100,39 +100,62 @@ def fit_rbf(
     data: TrainingSet, points: Subsample, choice: RBF | IncrementalRBF, seed: int
 ) -> CorrectiveFit:
     """Train an RBF network: width and ridge by cross-validation, then weights on all targets."""
+    tried = []
     if choice.directions == "per_input":
-        lengths = _relative_lengths(data, points, seed)
-        data = replace(data, z=data.z / lengths, scale=data.scale * lengths)
-        points = replace(points, points=points.points / lengths)
-    base = data.typical_distance
-    search = data.thinned(SEARCH_SAMPLES)
-
-    def best(widths: Iterable[float]) -> tuple[Array, Array, float]:
-        trials = [(*_cross_validate(search, points.points, base * w), w) for w in widths]
-        return min(trials, key=lambda trial: float(trial[0].sum()))
-
-    error, ridge, width = best(_WIDTHS if choice.width is None else (choice.width,))
-    if choice.width is None:
-        finer = best((width * _FINER, width / _FINER))
-        error, ridge, width = min((error, ridge, width), finer, key=lambda t: float(t[0].sum()))
-    total = _final_sums(data, points, base * width, choice.targets)
+        tried.append(_relative_lengths(data, points, seed))
+    tried.append(np.ones(data.z.shape[1]))
+    # Likelihood may take levels of an input for unrelated functions; runs left out know better.
+    found = [_search(data, points, lengths, choice.width) for lengths in tried]
+    k = int(np.argmin([error.sum() for error, _, _ in found]))
+    (error, ridge, width), lengths = found[k], tried[k]
+    data, points = data.stretched(lengths), replace(points, points=points.points / lengths)
+    size = width * data.typical_distance
+    total = _final_sums(data, points, size, choice.targets)
     mean, products = total.moments(centred=True)
     n = len(points.points)
     Q, right = products[:n, :n], products[:n, n:]
     if isinstance(choice, IncrementalRBF):
         used = _forward_selection(Q, right, np.diag(products)[n:], choice.goal, choice.neurons)
         # Few units explain less than all candidates do, and want another ridge.
-        error, ridge = _cross_validate(search, points.points[used], base * width)
+        error, ridge = _cross_validate(data.thinned(SEARCH_SAMPLES), points.points[used], size)
     else:
         used = np.arange(n)
     eigenvalues, V = np.linalg.eigh(Q[np.ix_(used, used)])
     weights = V @ _shrink(V.T @ right[used], eigenvalues, ridge)
     function = gaussian_units(
-        data, points.points[used], base * width, weights, mean[n:] - mean[used] @ weights
+        data, points.points[used], size, weights, mean[n:] - mean[used] @ weights
     )
     ridges = ", ".join(f"{r:.0e}" for r in ridge)
     detail = f"{len(used)} Gaussian units, relative width {width:.2g}, ridge {ridges}"
     return CorrectiveFit(function, 1 - error, detail)
+
+
+def _search(
+    data: TrainingSet, points: Subsample, lengths: Array, width: float | None
+) -> tuple[Array, Array, float]:
+    """Error on left-out runs, ridges and relative width for given lengths; the best, or as given.
+
+    Parameters
+    ----------
+    data, points
+        Samples, of which some judge, and the centres.
+    lengths
+        Of every input, shape ``(input,)``; only their ratios matter.
+    width
+        None tries several.
+    """
+    data, centres = data.stretched(lengths), points.points / lengths
+    base, judges = data.typical_distance, data.thinned(SEARCH_SAMPLES)
+
+    def best(widths: Iterable[float]) -> tuple[Array, Array, float]:
+        trials = [(*_cross_validate(judges, centres, base * w), w) for w in widths]
+        return min(trials, key=lambda trial: float(trial[0].sum()))
+
+    if width is not None:
+        return best((width,))
+    coarse = best(_WIDTHS)
+    finer = best((coarse[2] * _FINER, coarse[2] / _FINER))
+    return min(coarse, finer, key=lambda trial: float(trial[0].sum()))
 
 
 def _relative_lengths(data: TrainingSet, points: Subsample, seed: int) -> Array:

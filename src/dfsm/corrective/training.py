@@ -107,6 +107,10 @@ class TrainingSet:
         """Root-mean-square distance between two samples drawn at random."""
         return float(np.sqrt(2 * self.z.var(0).sum()))
 
+    def stretched(self, lengths: Array) -> TrainingSet:
+        """Measure every input in a length of its own, shape ``(input,)``."""
+        return replace(self, z=self.z / lengths, scale=self.scale * lengths)
+
     def subset(self, keep: NDArray[np.bool_] | IntArray) -> TrainingSet:
         """Keep some samples under the same standardisation."""
         kept = {name: getattr(self, name)[keep] for name in ("z", "targets", "runs", "folds")}
