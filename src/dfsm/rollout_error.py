@@ -23,7 +23,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import get_blas_funcs
 
 from dfsm.derivatives import differentiate
 from dfsm.filters import moving_average
@@ -37,7 +36,9 @@ from dfsm.signals import with_computed
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array, IntArray
 
-_SYRK: Any = get_blas_funcs("syrk", dtype=np.float64)
+# JᵀJ is summed over every fourth step, and over more where windows have few: slopes hardly change
+# from one to the next, and products of their matrices would be most of the time. Jᵀr is exact.
+_EVERY, _FEWEST = 4, 10
 
 
 @dataclass(frozen=True)
@@ -255,7 +256,6 @@ class RolloutError:
         """JᵀJ and Jᵀr of all of it."""
         parts = self._over_groups(_products, weights)
         JtJ, Jtr = (reduce(np.add, [p[k] for p in parts]) for k in (0, 1))
-        JtJ += np.triu(JtJ, 1).T
         if self._kept is not None:
             kept = self._kept.normal_equations(weights)
             JtJ, Jtr = (a + b for a, b in zip((JtJ, Jtr), kept, strict=True))
@@ -295,34 +295,38 @@ def _products(
     scale: Array,
     factors: tuple[float, float],
 ) -> tuple[Array, Array]:
-    """Upper half of JᵀJ, and Jᵀr, over the windows of one group; `factors` as in `_square`."""
+    """JᵀJ, nearly, and Jᵀr over the windows of one group; `factors` as in `_square`."""
     own, shared = factors
-    JtJ, Jtr, J_sum, r_sum = 0.0, 0.0, 0.0, 0.0
-    for windows in group:
-        J, r = (np.asarray(a) for a in _residuals(parameters, w, windows, scale))
-        # BLAS computes one half only, which is most of the time of a step with many parameters.
-        JtJ, Jtr = JtJ + _SYRK(own, J.T), Jtr + own * (J.T @ r)
+    errors = [np.asarray(_errors(parameters, w, windows, scale)) for windows in group]
+    total = np.sum(errors, axis=0)
+    JtJ, Jtr, J_sum = 0.0, 0.0, 0.0
+    for windows, r in zip(group, errors, strict=True):
+        J, slope = _slopes(parameters, w, windows, scale, own * r - shared * total)
+        J = np.asarray(J)
+        # NumPy computes one half of this product only, and other threads go on meanwhile.
+        JtJ, Jtr = JtJ + own * (J.T @ J), Jtr + np.asarray(slope)
         if shared:
-            J_sum, r_sum = np.add(J_sum, J), np.add(r_sum, r)
+            J_sum = np.add(J_sum, J)
     if shared:
-        J_sum, r_sum = np.asarray(J_sum), np.asarray(r_sum)
-        JtJ, Jtr = JtJ - _SYRK(shared, J_sum.T), Jtr - shared * (J_sum.T @ r_sum)
+        J_sum = np.asarray(J_sum)
+        JtJ = JtJ - shared * (J_sum.T @ J_sum)
     return np.asarray(JtJ), np.asarray(Jtr)
 
 
 @eqx.filter_jit
-def _residuals(
-    parameters: Parametrisation, w: jax.Array, windows: _Windows, scale: Array
+def _slopes(
+    parameters: Parametrisation, w: jax.Array, windows: _Windows, scale: Array, errors: Array
 ) -> tuple[jax.Array, jax.Array]:
-    """J and r over the windows of one run."""
+    """Rows of J that stand for all over the windows of one run, and Jᵀ times errors."""
     starts = _starts(parameters.at(w), windows)
     slopes = _start_slopes(parameters, w, windows)
-    follow = partial(sensitivities, parameters, w, windows.step)
-    each = (starts, slopes, jnp.asarray(windows.inputs))
-    xs, S = jax.lax.map(lambda one: follow(*one), each)
-    r = (xs[..., : len(scale)] - windows.states[:, 1:]) * scale
-    J = (S * scale[:, None]).reshape(-1, w.size)
-    return J, r.ravel()
+    steps = errors.shape[1]
+    every = max(1, min(_EVERY, steps // _FEWEST))
+    follow = partial(sensitivities, parameters, w, windows.step, every=every)
+    each = (starts, slopes, jnp.asarray(windows.inputs), jnp.asarray(errors * scale))
+    S, totals = jax.lax.map(lambda one: follow(*one), each)
+    J = S * (scale * np.sqrt(steps / (steps // every)))[:, None]
+    return J.reshape(-1, w.size), totals.sum(axis=0)
 
 
 def _start_slopes(parameters: Parametrisation, w: jax.Array, windows: _Windows) -> jax.Array:

@@ -35,8 +35,10 @@ def sensitivities(
     x0: jax.Array,
     pairs0: jax.Array,
     v: jax.Array,
+    errors: jax.Array,
+    every: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """States and slopes of the observed ones after every step, as `rk4` would find them.
+    """Slopes of the observed states along a rollout, as `rk4` would find them.
 
     Once the path is known, what each step does to the slopes, S ← Φ S + G, follows for all steps
     at once; only that recursion is left to march. A latent pair depends on its own parameters
@@ -54,30 +56,41 @@ def sensitivities(
         Slopes of the latent pairs there, shape ``(pair, 2, own)``.
     v
         Exogenous inputs at ends and middles, ``(2 step + 1, exogenous)``.
+    errors
+        Factors e of the slopes in a sum, ``(step, observed state)``.
+    every
+        After how many steps slopes are kept; the sum is over all.
 
     Returns
     -------
     tuple of Array
-        Shapes ``(step, state)`` and ``(step, observed state, parameter)``.
+        S after every so many steps, ``(step // every, observed state, parameter)``, and Σ Sᵀ e,
+        ``(parameter,)``.
     """
     model = parameters.at(w)
     path = _path(parameters, model, step, x0, pairs0, v)
     observed, steps = len(model.signals.observed), len(path.states)
 
-    def along(S: jax.Array, part: _Path) -> tuple[jax.Array, jax.Array]:
-        return jax.lax.scan(_advance, S, _transitions(parameters, w, model, step, part))
+    def along(
+        at: tuple[jax.Array, jax.Array], block: tuple[_Path, jax.Array]
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        S, total = at
+        part, e = block
+        S, each = jax.lax.scan(_advance, S, _transitions(parameters, w, model, step, part))
+        return (S, total + jnp.einsum("tap,ta->p", each, e)), each[every - 1 :: every]
 
-    # Blocks stay in the cache; beyond the end the last step is repeated, and dropped again.
-    size = min(_BLOCK, steps)
+    # Blocks stay in the cache; beyond the end the last step is repeated, and does not count.
+    size = -(-min(_BLOCK, steps) // every) * every
     count = -(-steps // size)
 
-    def blocks(a: jax.Array) -> jax.Array:
+    def blocks(a: jax.Array, mode: str) -> jax.Array:
         end = [(0, count * size - steps)] + [(0, 0)] * (a.ndim - 1)
-        return jnp.pad(a, end, mode="edge").reshape(count, size, *a.shape[1:])
+        return jnp.pad(a, end, mode=mode).reshape(count, size, *a.shape[1:])
 
-    S0 = jnp.zeros((observed, w.size))
-    S = jax.lax.scan(along, S0, jax.tree.map(blocks, path))[1]
-    return path.states, S.reshape(count * size, *S0.shape)[:steps]
+    along_path = jax.tree.map(partial(blocks, mode="edge"), path)
+    start = jnp.zeros((observed, w.size)), jnp.zeros(w.size)
+    (_, total), S = jax.lax.scan(along, start, (along_path, blocks(errors, "constant")))
+    return S.reshape(-1, observed, w.size)[: steps // every], total
 
 
 def _advance(S: jax.Array, transition: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
