@@ -75,10 +75,8 @@ def squared_distance(
     inputs: jax.Array, shares: jax.Array, middles: jax.Array, W: jax.Array
 ) -> jax.Array:
     """Σ_k h_k |W_k (I − μ_k)|² of inputs ``(..., input)`` and shares h ``(..., point)``."""
-    total = jnp.zeros(inputs.shape[:-1])
-    for k, (middle, rows) in enumerate(zip(middles, W, strict=True)):
-        total += shares[..., k] * jnp.sum(((inputs - middle) @ rows.T) ** 2, axis=-1)
-    return total
+    apart = jnp.einsum("kri,...i->...kr", W, inputs) - jnp.einsum("kri,ki->kr", W, middles)
+    return jnp.einsum("...k,...kr,...kr->...", shares, apart, apart)
 
 
 def _groups(runs: IntArray) -> IntArray:

@@ -134,9 +134,12 @@ class LinearModel(eqx.Module):
         """Weight of every schedule point at one input vector, shape ``(point,)``."""
         return hats(self.grid, inputs[self.schedule or 0])
 
-    def __call__(self, inputs: jax.Array) -> jax.Array:
-        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
-        L, b = self.at(inputs[self.schedule] if self.schedule is not None else 0.0)
+    def __call__(self, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
+        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``.
+
+        `value` is the schedule's; None takes it from the inputs, see `schedule.scheduled`.
+        """
+        L, b = self.at(inputs[self.schedule or 0] if value is None else value)
         return L @ inputs + b
 
 

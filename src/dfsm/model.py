@@ -9,7 +9,7 @@ one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `d
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ import dfsm.jax_setup  # noqa: F401
 from dfsm.corrective.functions import Corrective
 from dfsm.errors import DfsmError, printable
 from dfsm.linear import LinearModel
+from dfsm.schedule import scheduled
 from dfsm.signals import Provenance, Region, SignalTable, blade_harmonics
 from dfsm.trajectory import labels
 from dfsm.types import Array, ComplexArray
@@ -95,8 +96,8 @@ class DFSM(eqx.Module):
         Array
             State derivatives per second, shape ``(..., state)``.
         """
-        inputs = self.join(states, controls, disturbances, parameters)
-        return _evaluate(self, _derivative, inputs)
+        groups = self._groups(states, controls, disturbances, parameters)
+        return _evaluate(self, _derivative, _joined(groups), scheduled(self.f.schedule, groups))
 
     def output(
         self,
@@ -121,18 +122,20 @@ class DFSM(eqx.Module):
         Array
             Outputs, shape ``(..., output)``.
         """
-        inputs = self.join(states, controls, disturbances, parameters)
+        groups = self._groups(states, controls, disturbances, parameters)
+        inputs = _joined(groups)
         if self.g is None:
             return jnp.zeros((*inputs.shape[:-1], 0))
+        value = scheduled(self.g.schedule, groups)
         if self.signals.azimuth is None:
-            return _evaluate(self, _output, inputs)
+            return _evaluate(self, _output, inputs, value)
         if azimuth is None:
             harmonics = jnp.zeros((*inputs.shape[:-1], 2))
         else:
             harmonics = blade_harmonics(azimuth, self.signals.azimuth.blades)
         shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
         parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
-        return _evaluate(self, _output, jnp.concatenate(parts, axis=-1))
+        return _evaluate(self, _output, jnp.concatenate(parts, axis=-1), value)
 
     def join(
         self,
@@ -148,7 +151,17 @@ class DFSM(eqx.Module):
         DfsmError
             A group has the wrong number of elements.
         """
-        parts = []
+        return _joined(self._groups(states, controls, disturbances, parameters))
+
+    def _groups(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike,
+    ) -> list[jax.Array]:
+        """u, w, ξ and p as arrays; those with a wrong number of elements are refused."""
+        groups = []
         for group, value in (
             ("controls", controls),
             ("disturbances", disturbances),
@@ -162,9 +175,8 @@ class DFSM(eqx.Module):
                     f"{group} have shape {array.shape}, expected the last axis to hold "
                     f"{len(names)}: {', '.join(names) or 'none'}"
                 )
-            parts.append(array)
-        shape = jnp.broadcast_shapes(*(p.shape[:-1] for p in parts))
-        return jnp.concatenate([jnp.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
+            groups.append(array)
+        return groups
 
     def split(self, inputs: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Take I apart: states, controls, disturbances, parameters."""
@@ -297,44 +309,57 @@ def _complex(value: complex) -> str:
     return f"{value.real:.3g}" + (f" ± {value.imag:.3g}i" if value.imag else "")
 
 
-def _derivative(model: DFSM, inputs: jax.Array) -> jax.Array:
-    return _sum(model.f, model.e, model.corrected, inputs)
+def _joined(groups: Sequence[jax.Array]) -> jax.Array:
+    shape = jnp.broadcast_shapes(*(g.shape[:-1] for g in groups))
+    return jnp.concatenate([jnp.broadcast_to(g, (*shape, g.shape[-1])) for g in groups], axis=-1)
 
 
-def _output(model: DFSM, inputs: jax.Array) -> jax.Array:
+def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
+    return _sum((model.f, model.e, model.corrected), inputs, value)
+
+
+def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
     if model.g is None:
         return jnp.zeros(0)
-    return _sum(model.g, model.e_g, model.corrected_outputs, inputs)
+    return _sum((model.g, model.e_g, model.corrected_outputs), inputs, value)
 
 
 def _sum(
-    linear: LinearModel, corrective: Callable | None, rows: tuple[int, ...], inputs: jax.Array
+    parts: tuple[LinearModel, Corrective | None, tuple[int, ...]],
+    inputs: jax.Array,
+    value: jax.Array | None,
 ) -> jax.Array:
-    value = linear(inputs)
+    """A linear fit, and its corrective function in some rows, at one input vector."""
+    linear, corrective, rows = parts
+    total = linear(inputs, value)
     if corrective is None:
-        return value
+        return total
     # Written out per row: a scatter costs more than all the rest of a small model.
     place = {row: k for k, row in enumerate(rows)}
     extra = corrective(inputs)
-    return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(value)])
+    return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(total)])
 
 
-Row = Callable[[DFSM, jax.Array], jax.Array]
+Row = Callable[..., jax.Array]
 
 
 @eqx.filter_jit
-def _evaluate(model: DFSM, row: Row, inputs: jax.Array) -> jax.Array:
-    """Evaluate `_derivative` or `_output` at inputs ``(..., input)``."""
+def _evaluate(model: DFSM, row: Row, inputs: jax.Array, value: jax.Array) -> jax.Array:
+    """Evaluate `_derivative` or `_output` at inputs ``(..., input)``.
+
+    `value` is the schedule's there, of a shape that broadcasts to ``(...)``.
+    """
     model = model.prepared()
     flat = inputs.reshape(-1, inputs.shape[-1])
+    values = jnp.broadcast_to(value, inputs.shape[:-1]).ravel()
 
-    def one(inputs: jax.Array) -> jax.Array:
-        return row(model, inputs)
+    def one(at: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return row(model, *at)
 
     # Blocks keep the activations of hundreds of units in the cache instead of in memory.
-    many = flat.shape[0] > 2 * _BLOCK
-    values = jax.lax.map(one, flat, batch_size=_BLOCK) if many else jax.vmap(one)(flat)
-    return values.reshape(*inputs.shape[:-1], values.shape[-1])
+    many, given = flat.shape[0] > 2 * _BLOCK, (flat, values)
+    found = jax.lax.map(one, given, batch_size=_BLOCK) if many else jax.vmap(one)(given)
+    return found.reshape(*inputs.shape[:-1], found.shape[-1])
 
 
 @eqx.filter_jit

@@ -265,22 +265,23 @@ class Region(eqx.Module):
         """
         return self._squared(jnp.asarray(inputs), slice(None))
 
-    def distance_chosen(self, inputs: ArrayLike) -> jax.Array:
+    def distance_chosen(self, inputs: ArrayLike, value: jax.Array | None = None) -> jax.Array:
         """What controls and states add to the distance, over what the disturbances leave for them.
 
         1 where all of ``(..., input)`` are as far from the training data as is usual. Disturbances
         that are unusual themselves leave at least a fifth: somewhat more than controls and states
-        of the training runs take on average.
+        of the training runs take on average. `value` is the schedule's, ``(...)``; None takes it
+        from the inputs.
         """
         inputs = jnp.asarray(inputs)
-        given = self._squared(inputs, slice(self.fixed))
-        added = self._squared(inputs, slice(self.fixed, None))
+        given = self._squared(inputs, slice(self.fixed), value)
+        added = self._squared(inputs, slice(self.fixed, None), value)
         return added / jnp.maximum(1 - given, _LEFT)
 
-    def _squared(self, inputs: jax.Array, rows: slice) -> jax.Array:
+    def _squared(self, inputs: jax.Array, rows: slice, value: jax.Array | None = None) -> jax.Array:
         if not self.whitening.size:
             return jnp.zeros(inputs.shape[:-1])
-        shares = hats(self.grid, inputs[..., self.schedule or 0])
+        shares = hats(self.grid, inputs[..., self.schedule or 0] if value is None else value)
         return squared_distance(inputs, shares, self.operating, self.whitening[:, rows])
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import dfsm.jax_setup  # noqa: F401
 from dfsm.errors import DfsmError, near_matches
 from dfsm.model import DFSM
+from dfsm.schedule import scheduled
 from dfsm.signals import Region
 from dfsm.simulators import ODESystem
 from dfsm.trajectory import Channel
@@ -144,7 +145,8 @@ class Signals:
         region = self._plant.region
         if region is None:
             return jnp.zeros(())
-        return region.distance_chosen(jnp.concatenate([u, w, x, p]))
+        groups = [jnp.asarray(g) for g in (u, w, x, p)]
+        return region.distance_chosen(jnp.concatenate(groups), scheduled(region.schedule, groups))
 
     @property
     def y(self) -> Group:
