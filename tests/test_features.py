@@ -118,6 +118,26 @@ def test_a_model_learns_through_features_and_keeps_them(tmp_path):
     assert "run9" in validate(model, [test]).to_dict()["runs"][0]["name"]
 
 
+def test_what_is_computed_does_not_decide_the_order_of_runs():
+    """Its last digits differ from one processor to the next."""
+    runs = [with_features(driven(s), [RATE]) for s in range(5)]
+    rounding = 1 + 1e-12 * np.array([False, False, True])
+    other = [replace(r, values=r.values * rounding) for r in runs]
+    assert [r.digest for r in other] == [r.digest for r in runs]
+    assert [r.digest for r in runs] == [driven(s).digest for s in range(5)]
+    assert runs[0].select(["w_dot"]).digest != other[0].select(["w_dot"]).digest
+    moved = runs[0].values.copy()
+    moved[0, 0] += 1e-12
+    assert replace(runs[0], values=moved).digest != runs[0].digest
+
+
+def test_a_training_run_is_known_again_without_its_features():
+    runs = [driven(s) for s in range(3)]
+    model = fit(runs, SETTINGS).model
+    told = validate(model, [driven(1), driven(9)]).warnings
+    assert any("1 of the 2 test runs were used in training (run1)" in text for text in told)
+
+
 def test_features_come_from_the_record_before_the_start():
     model = fit([driven(s) for s in range(2)], SETTINGS).model
     whole = simulate(model, driven(9), start=10.0).trajectory

@@ -87,11 +87,10 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
         run.columns([feature.source])
         source = run.select([feature.source]).require_finite().channels[0]
         if feature.kind == "rate":
-            values = _rate(run, feature)
-            channel = Channel(feature.name, per_second(source.unit), role="disturbance")
+            values, unit = _rate(run, feature), per_second(source.unit)
         else:
-            values = _lagged(run, feature)
-            channel = Channel(feature.name, source.unit, role="disturbance")
+            values, unit = _lagged(run, feature), source.unit
+        channel = Channel(feature.name, unit, role="disturbance", computed=True)
         run = run.select(n for n in run.names if n != feature.name)
         run = run.with_channels([channel], values)
     return run

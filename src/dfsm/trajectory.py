@@ -43,12 +43,15 @@ class Channel:
         rounding error is uniform over one step, so its variance is ``step**2 / 12``.
     role
         What the signal is to a model, once that has been chosen.
+    computed
+        Whether it follows from other channels of the run, up to a processor's rounding.
     """
 
     name: str
     unit: str = ""
     step: float | None = None
     role: Role | None = None
+    computed: bool = False
 
     @property
     def label(self) -> str:
@@ -195,11 +198,18 @@ class Trajectory:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of time, values, names and units: what the run holds, not where it lay."""
+        """SHA-256 of time, values, names and units: what the run holds, not where it lay.
+
+        Of what was recorded, if anything was: computed channels differ in the last digits from one
+        processor to the next, and runs must have the same order on all.
+        """
+        recorded = [i for i, c in enumerate(self.channels) if not c.computed]
+        columns = recorded or list(range(len(self.channels)))
         h = hashlib.sha256()
         h.update(np.ascontiguousarray(self.time).tobytes())
-        h.update(np.ascontiguousarray(self.values).tobytes())
-        h.update("\0".join(f"{c.name}\0{c.unit}" for c in self.channels).encode())
+        h.update(np.ascontiguousarray(self.values[:, columns]).tobytes())
+        names = (f"{self.channels[i].name}\0{self.channels[i].unit}" for i in columns)
+        h.update("\0".join(names).encode())
         return h.hexdigest()
 
     # -- new trajectories from old --------------------------------------------------------------

@@ -70,7 +70,7 @@ def undisturbed_rotor_wind(
     if source.step is not None and motion.step is not None:
         step = math.hypot(source.step, arm * motion.step)
     corrected = trajectory[wind] + arm * trajectory[rate]
-    return trajectory.with_channels([Channel(name, source.unit, step)], corrected)
+    return trajectory.with_channels([Channel(name, source.unit, step, computed=True)], corrected)
 
 
 def wind_warning(name: str) -> str | None:
