@@ -264,10 +264,47 @@ def test_constant_coefficients(runs):
         fit(runs, replace(choices, linear=LPV(schedule="w", constant=("torque",))))
 
 
-def test_staying_inside_does_not_bind_what_only_disturbances_drive(runs, plain):
-    """Unusual wind takes latent states beyond their training range; nobody can help it."""
+@pytest.fixture(scope="module")
+def by_wind(runs, plain):
+    """A model whose latent states disturbances alone drive."""
     choices = replace(REFINEMENT, latent_inputs=("w",), windows=(5.0,), iterations=2)
-    model = refine(plain, runs, choices, start=START).model
+    return refine(plain, runs, choices, start=START).model
+
+
+@pytest.mark.parametrize("scheme", ["trapezoidal", "radau"])
+def test_what_disturbances_alone_drive_is_not_solved_for(by_wind, scheme):
+    problem = OptimalControlProblem(
+        model=by_wind,
+        horizon=(START, 40.0),
+        cost=lambda s: (s.x.q - 0.1 * s.x.latent1) ** 2 + 0.1 * s.u.u**2,
+        disturbances=driven(98),
+    )
+    # A bound, however wide, makes it a state like any other.
+    asked = replace(problem, bounds={"latent1": (-10.0, 10.0)})
+    method = DirectTranscription(scheme=scheme, mesh=200, refine=None)
+    found, other = (solve(p, method) for p in (problem, asked))
+    assert set(problem.latent_paths(np.array([START]))) == {"latent1", "latent2"}
+    assert not asked.latent_paths(np.array([START]))
+    assert found.solved
+    assert other.solved
+    assert found.objective == pytest.approx(other.objective, rel=2e-3)
+    names = ["latent1", "latent2"]
+    for name in names:
+        # Known exactly, so that an adaptive integrator finds the same.
+        assert found.replays[0].deviation[name] < 1e-4 * np.ptp(found.trajectory[name])
+    assert found.costates[0].names == ("q",)
+    assert other.costates[0].names == ("q", *names)
+
+
+def test_what_controls_drive_is_solved_for(model):
+    cost = {"horizon": (START, 30.0), "cost": lambda s: s.x.q**2}
+    problem = OptimalControlProblem(model=model, disturbances=driven(98), **cost)
+    assert not problem.latent_paths(np.array([START]))
+
+
+def test_staying_inside_does_not_bind_what_only_disturbances_drive(by_wind):
+    """Unusual wind takes latent states beyond their training range; nobody can help it."""
+    model = by_wind
     run = driven(98)
     values = run.values.copy()
     values[:, run.names.index("w")] *= 1.6

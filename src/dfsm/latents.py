@@ -169,6 +169,14 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     return np.asarray(path)[: len(run)]
 
 
+def latents_at(model: DFSM, run: Trajectory, time: Array) -> Array:
+    """Latent states at times in s within a run, ``(time, latent)``; see `latent_path`."""
+    time = np.clip(time, run.time[0], run.time[-1])
+    both = np.union1d(run.time, time)
+    path = latent_path(model, run.select(model.signals.driving).resample(both))
+    return path[np.searchsorted(both, time)]
+
+
 def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
     """Latent states at a time in s, shape ``(latent,)``, from the inputs recorded up to it.
 

@@ -123,22 +123,24 @@ def program_of(
 
 def defects(layout: Layout, grid: Grid, scale: Array, outputs: int) -> Part:
     """D X − T A F = 0; the outputs of a node are [T L, T ẋ, …]."""
-    x, _, _ = layout.columns
+    state = layout.solved
+    x = layout.columns[0][:, :, state]
     D, A = grid.defects
-    scenario, nx = np.arange(layout.scenarios)[:, None, None], x.shape[2]
+    scenario, nx = np.arange(layout.scenarios)[:, None, None], len(state)
     shape = (layout.scenarios, D.shape[0], nx)
     # Axes: scenario, element of the matrix, state.
-    state = np.arange(nx)
-    to = (scenario * D.shape[0] + D.row[None, :, None]) * nx + state
+    place = np.arange(nx)
+    to = (scenario * D.shape[0] + D.row[None, :, None]) * nx + place
     linear = entries(to, x[:, D.column, :], D.value[:, None])
-    to = (scenario * D.shape[0] + A.row[None, :, None]) * nx + state
+    to = (scenario * D.shape[0] + A.row[None, :, None]) * nx + place
     source = (scenario * layout.nodes + A.column[None, :, None]) * outputs + 1 + state
     index = np.arange(np.prod(shape)).reshape(shape)
     middle = grid.edges[:-1] + grid.lengths / 2
     times = np.interp(np.repeat(middle, shape[1] // grid.intervals), layout.tau, layout.time)
+    names = layout.problem.plant.names("states")
     rows = [
-        Rows(f"dynamics of {name}", index[:, :, i].ravel(), np.tile(times, layout.scenarios))
-        for i, name in enumerate(layout.problem.plant.names("states"))
+        Rows(f"dynamics of {names[k]}", index[:, :, i].ravel(), np.tile(times, layout.scenarios))
+        for i, k in enumerate(state)
     ]
     zeros = np.zeros(index.size)
     size = np.broadcast_to(scale[x[:, :1, :]], shape).ravel()

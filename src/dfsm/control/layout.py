@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -37,6 +38,9 @@ class Layout:
         Where the solve starts; gives the sizes of variables without bounds.
     stay_inside
         Whether the training range of a surrogate bounds controls, measured states and parameters.
+    known
+        States that are known at all nodes, by name, shapes ``(scenario, node)``: variables that
+        cannot move.
     """
 
     problem: OptimalControlProblem
@@ -46,6 +50,7 @@ class Layout:
     control_node: IntArray
     start: Start
     stay_inside: bool
+    known: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def scenarios(self) -> int:
@@ -67,6 +72,12 @@ class Layout:
         """Times of the nodes in s; for a free last time those of the start."""
         # There all limits are constant, so that any times serve.
         return self.problem.start + self.tau * (self.start.stop - self.problem.start)
+
+    @cached_property
+    def solved(self) -> IntArray:
+        """Which of the states are to be found."""
+        names = self.problem.plant.names("states")
+        return np.array([i for i, n in enumerate(names) if n not in self.known], dtype=int)
 
     @property
     def free_time(self) -> bool:
@@ -150,6 +161,9 @@ class Layout:
             for at, value in zip(x[:, 0, plant.names("states").index(name)], values, strict=True):
                 if value is not None:
                     low[at] = high[at] = value
+        for name, values in self.known.items():
+            at = x[:, :, plant.names("states").index(name)]
+            low[at] = high[at] = values
         for at, name in zip(q, self.problem.free_parameters, strict=False):
             given = self.problem.parameters[name]
             below, above = self._inside(name, *map(np.atleast_1d, given))  # pyright: ignore
@@ -159,11 +173,12 @@ class Layout:
         return np.where(low <= -_NONE, -np.inf, low), np.where(high >= _NONE, np.inf, high)
 
     def costates(self, tau: Array, values: Array) -> tuple[Trajectory, ...]:
-        """Values at normalised times as trajectories, from ``(scenario, time, state)``."""
+        """Values at normalised times as trajectories, from ``(scenario, time, solved state)``."""
         if len(tau) == 1:  # a trajectory has two samples
             tau, values = np.array([0.0, 1.0]), np.repeat(values, 2, axis=1)
         time = self.problem.start + tau * (self.start.stop - self.problem.start)
-        channels = tuple(Channel(c.name) for c in self.problem.plant.channels["states"])
+        names = np.array(self.problem.plant.names("states"))[self.solved]
+        channels = tuple(map(Channel, names.tolist()))
         return tuple(Trajectory(time, v, channels, name="costates") for v in values)
 
     def channel_limits(self, name: str, time: Array) -> tuple[Array, Array]:

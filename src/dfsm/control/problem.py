@@ -18,7 +18,7 @@ import numpy as np
 
 from dfsm.control.signals import GROUPS, Plant, plant_of
 from dfsm.errors import DfsmError, near_matches
-from dfsm.latents import latent_state
+from dfsm.latents import latent_state, latents_at, poles
 from dfsm.model import DFSM
 from dfsm.settings import require
 from dfsm.signals import with_computed
@@ -183,6 +183,32 @@ class OptimalControlProblem:
             for k, name in enumerate(self.latents)
             if name not in self.initial
         }
+
+    def latent_paths(self, time: Array) -> dict[str, Array]:
+        """Latent states that disturbances alone drive, at times in s, by name.
+
+        There is nothing to choose about these, so that they need not be solved for.
+
+        Returns
+        -------
+        dict
+            Shapes ``(scenario, time)``. A pair that controls drive, that starts freely, or that the
+            problem bounds is missing.
+        """
+        if not isinstance(self.model, DFSM) or self.free_time is not None:
+            return {}
+        chosen = np.asarray(poles(self.model).drive)[:, : len(self.plant.names("controls"))]
+        asked = {*self.bounds, *self.final}
+        known = []
+        for *pair, drive in zip(self.latents[::2], self.latents[1::2], chosen, strict=True):
+            starts = [v for n in pair for v in self.latent_starts.get(n, [None])]
+            if not (drive.any() or None in starts or asked & {*pair}):
+                known += pair
+        if not known:
+            return {}
+        runs = [run for run in self.scenarios if run is not None]
+        paths = np.stack([latents_at(self.model, run, time) for run in runs])
+        return {name: paths[..., self.latents.index(name)] for name in known}
 
     @property
     def scenario_weights(self) -> Array:

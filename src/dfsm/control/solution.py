@@ -93,7 +93,7 @@ class Solution:
         units and roles. The last time is the optimal one.
     costates
         Per scenario: multipliers of the dynamics, ∂J/∂ξ, in the objective's unit per unit of each
-        state.
+        state. Direct transcription has none for latent states that disturbances alone drive.
     multipliers
         Of path and boundary constraints by name, shape ``(scenario × time,)``, in the
         objective's unit per unit of the constraint.

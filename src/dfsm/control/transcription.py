@@ -9,6 +9,7 @@ Ch. 4). Which scheme it is only enters through the matrices of the `Grid`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,9 +96,10 @@ class Transcription:
         self.problem, self.grid = problem, grid
         self.functions = functions_of(problem)
         nodes = np.arange(len(grid.tau))
-        self.layout = Layout(
-            problem, self.functions, grid.tau, nodes, grid.control_node, start, stay_inside
-        )
+        places = grid.tau, nodes, grid.control_node
+        self.layout = Layout(problem, self.functions, *places, start, stay_inside)
+        known = problem.latent_paths(self.layout.time)
+        self.layout = replace(self.layout, known=known)
         self.common = common_of(problem)
         self.program = self._program()
 
@@ -161,18 +163,18 @@ class Transcription:
         """∂J/∂ξ from the multipliers of the defects, per scenario.
 
         Radau's belong to its collocation points (Garg et al. 2011), the others' to the middles of
-        the intervals.
+        the intervals. States that are known beforehand have none.
         """
         layout, grid = self.layout, self.grid
-        defects = len(grid.scheme.D)
-        shape = (layout.scenarios, grid.intervals, defects, self.functions.nx)
+        defects, states = len(grid.scheme.D), len(layout.solved)
+        shape = (layout.scenarios, grid.intervals, defects, states)
         values = -multipliers[: int(np.prod(shape))].reshape(shape)
         if grid.kind == "radau":
             values = values / grid.scheme.weights[1:, None]
             tau = grid.tau[1:]
         else:
             values, tau = values[:, :, -1:], grid.edges[:-1] + grid.lengths / 2
-        values = values.reshape(layout.scenarios, -1, self.functions.nx)
+        values = values.reshape(layout.scenarios, -1, states)
         return layout.costates(tau, values)
 
     def slopes(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
@@ -208,7 +210,7 @@ class Transcription:
         ).reshape(X.shape)
         missing = np.einsum("g,skgx->skx", grid.checked[1], np.abs(dX - f)) * grid.lengths[:, None]
         size = np.maximum(np.abs(start.X).max(axis=(0, 1)), 1e-3 * self._sizes())
-        return (missing / size).max(axis=(0, 2))
+        return (missing / size)[..., self.layout.solved].max(axis=(0, 2))
 
     def _sizes(self) -> Array:
         return self.program.scale[self.layout.columns[0][0, 0]]
