@@ -206,6 +206,26 @@ def test_slopes_agree_with_differences(runs, biased, size):
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize(("length", "rel"), [(1.0, 1e-5), (10.0, 0.05)])
+def test_curvature_is_that_of_all_steps(runs, biased, length, rel):
+    """Exactly in short windows; in long ones every fourth step stands for all."""
+    records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:2]]
+    parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
+    problem = RolloutError(parameters, [records], length, ErrorWeights(np.ones(2)))
+    at, eps = 0.01 * np.random.default_rng(0).normal(size=parameters.size), 1e-5
+    errors = sys.modules[RolloutError.__module__]._errors
+
+    def residuals(w: np.ndarray) -> np.ndarray:
+        (group,), (scale,) = problem._groups, problem._scales
+        return np.concatenate([np.ravel(errors(parameters, w, part, scale)) for part in group])
+
+    directions = eps * np.eye(parameters.size)
+    J = [(residuals(at + d) - residuals(at - d)) / (2 * eps) for d in directions]
+    expected = np.array(J) @ np.array(J).T
+    found, _ = problem.normal_equations(at)
+    assert np.linalg.norm(found - expected) < rel * np.linalg.norm(expected)
+
+
 @pytest.mark.parametrize("network", [0, 3])
 def test_growth_adds_to_the_cost_with_exact_slopes(runs, biased, network):
     """Slopes against differences where an eigenvalue is past the margin, and the wall."""

@@ -55,7 +55,12 @@ class Correction:
 
 
 def correct(
-    samples: Samples, inputs: Array, targets: Array, linear: LinearFit, choices: FitSettings
+    samples: Samples,
+    inputs: Array,
+    targets: Array,
+    linear: LinearFit,
+    choices: FitSettings,
+    later: bool = False,
 ) -> Correction:
     """Train a corrective function for the rows whose residual is large, and say which and why.
 
@@ -69,6 +74,8 @@ def correct(
         The linear fit of the targets.
     choices
         Settings.
+    later
+        Train nothing: refinement is going to add a network.
 
     Returns
     -------
@@ -81,7 +88,7 @@ def correct(
     known = kinematic_rows(choices.states) if derivatives else {}
     large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > choices.gate]
     function, explained, detail = None, dict[int, float](), ""
-    if large and not isinstance(choices.corrective, NoCorrection):
+    if large and not later and not isinstance(choices.corrective, NoCorrection):
         hidden, seen = list(linear.model.known_inputs), inputs
         if hidden:
             seen = inputs.copy()
@@ -114,7 +121,8 @@ def correct(
             else:
                 text += f"only {explained[i]:.1%} of its variance in cross-validation"
         else:
-            text = f"linear fit, residual {ratio[i]:.1%} of the signal, corrections switched off"
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal, "
+            text += "rollouts teach a network the rest" if later else "corrections switched off"
         decisions.append(
             {
                 "name": name,

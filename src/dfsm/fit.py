@@ -105,7 +105,8 @@ def fit(
     with _timed(seconds, "linear fit"):
         f = _fit_derivatives(samples, choices)
     with _timed(seconds, "corrective functions"):
-        e = correct(samples, samples.inputs, samples.derivatives, f, choices)
+        later = refinement is not None and refinement.network > 0
+        e = correct(samples, samples.inputs, samples.derivatives, f, choices, later)
     region = _region(samples, f.model, data)
     model = DFSM(
         f=f.model,
@@ -370,7 +371,7 @@ def _record(
 ) -> dict[str, Any]:
     return {
         "settings": asdict(choices),
-        "channels": list(data[0].names),
+        "channels": [c.name for c in data[0].channels if not c.computed],
         "data": [
             {"name": r.name, "samples": len(r), "sha256": r.digest, "seconds": r.duration}
             for r in data

@@ -60,8 +60,8 @@ class RefineSettings:
     latent_inputs
         Controls and disturbances that drive them; None takes all.
     network
-        Hidden units of a tanh network to add to a derivative function that the fit left
-        uncorrected; what derivatives do not show, rollouts may.
+        Hidden units of a tanh network to add to a derivative function that is not corrected; what
+        derivatives do not show, rollouts may. `fit` then corrects outputs only.
     iterations
         Largest number of Levenberg-Marquardt steps per stage.
     decay
