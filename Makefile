@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/demo.py --output out
-	$(BIN)/python examples/iea15/optimal_control.py --models out --output out --quick
+	$(BIN)/python examples/iea15/optimal_control.py --models out --output out
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder

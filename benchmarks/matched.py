@@ -44,7 +44,7 @@ def run() -> dict[str, Any]:
             found[str(correlation)] = judged(model, tests, pairs)
             if not correlation:
                 models["all winds"] = model
-        models["wind below rated"] = turbine.below_rated()
+        models["wind below rated"] = turbine.below_rated().model
     tests = turbine.runs([turbine.BELOW_RATED], range(9, 11))
     pair = next(pair for pair in pairs if f"_{turbine.BELOW_RATED}mps" in pair[0].name)
     below = {name: judged(model, tests, [pair]) for name, model in models.items()}

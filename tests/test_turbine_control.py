@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -73,6 +74,17 @@ def test_every_case_is_solved_within_its_bounds(found: ControlStudy):
             assert run[name].max() <= high + slack, name
         assert len(run.time) == SIZE.points
         assert run.duration == pytest.approx(600)
+
+
+def test_series_can_be_solved_in_other_processes(region: Region, found: ControlStudy):
+    # What goes there and comes back; `work_through` has tests of its own.
+    model = pickle.loads(pickle.dumps(region)).model
+    np.testing.assert_array_equal(model.f.coefficients, region.model.f.coefficients)
+    again = pickle.loads(pickle.dumps(found.results))
+    for one, other in zip(again, found.results, strict=True):
+        assert one.variant == other.variant
+        assert one.power == other.power
+        np.testing.assert_array_equal(one.run.values, other.run.values)
 
 
 def test_bounds_of_this_turbine_come_from_its_own_runs(region: Region):

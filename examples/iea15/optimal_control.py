@@ -2,9 +2,9 @@
 
 Takes the models that `demo.py` saved and maximises the power over 600 s of wind that the fits never
 saw, with the paper's bounds and with those of this turbine, for three limits of the platform pitch.
-Below rated wind it fits a model that knows more. Writes a page, its tables as JSON, and figures.
+Writes a page, its tables as JSON, and figures.
 
-    python examples/iea15/optimal_control.py [--models out/] [--output out/] [--quick]
+    python examples/iea15/optimal_control.py [--models out/] [--output out/]
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import demo  # its neighbour
@@ -21,24 +21,23 @@ import dfsm
 from dfsm.console import print_article
 from dfsm.report.publish import publish
 from dfsm.report.turbine_control import control_article
-from dfsm.studies.turbine_control import ControlStudy, ControlStudySize, Region, study
+from dfsm.studies.turbine_control import ControlStudy, Region, study
+from dfsm.workers import processors
 
 # Winds (m/s, as in the file names) and the seeds to optimise for: two in the transition region,
 # one below and one above it.
 SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
-QUICK, FEW = {"12": range(9, 10)}, ControlStudySize(pitch_limits=(5.0, 7.0))
 
 
-def regions(models: Path, series: Mapping[str, range]) -> list[Region]:
+def regions(models: Path) -> list[Region]:
     """Models and runs of each region; one model serves all but that below rated wind."""
-    everywhere, found = dfsm.load(models / "model_all_winds"), []
-    for wind, seeds in series.items():
-        own = dfsm.load(models / f"model_{int(wind)}mps")
-        model = demo.below_rated() if wind == demo.BELOW_RATED else everywhere
-        speed = float(wind)
+    found = []
+    for wind, seeds in SERIES.items():
+        name = f"{float(wind):g} m/s"
+        best = demo.FOR_CONTROL if wind == demo.BELOW_RATED else "all winds"
+        own, model = (dfsm.load(demo.folder(models, label)) for label in (name, best))
         training, tests = demo.runs([wind], range(1, 9)), demo.runs([wind], seeds)
-        name = f"{speed:g} m/s"
-        found.append(Region(name, speed, own, model, training, tests, demo.START))
+        found.append(Region(name, float(wind), own, model, training, tests, demo.START))
     return found
 
 
@@ -47,14 +46,15 @@ def main(arguments: Sequence[str] | None = None) -> ControlStudy:
     parser = argparse.ArgumentParser(description="Optimal control on bundled OpenFAST runs.")
     parser.add_argument("--models", type=Path, default=Path("out"), help="folder of demo.py")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")
-    parser.add_argument("--quick", action="store_true", help="one series, two limits")
     options = parser.parse_args(arguments)
-    series, size = (QUICK, FEW) if options.quick else (SERIES, ControlStudySize())
-    if not (options.models / "model_all_winds").is_dir():
-        parser.error(f"{options.models} holds no models: run examples/iea15/demo.py first")
+    missing = [n for n in demo.WINDS if not demo.folder(options.models, n).is_dir()]
+    if missing:
+        parser.error(
+            f"{options.models} holds no model '{missing[0]}': run examples/iea15/demo.py first"
+        )
     with dfsm.show_progress(), warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)  # they stand in the tables
-        found = study(regions(options.models, series), size)
+        found = study(regions(options.models), jobs=processors())
     article = control_article(found)
     written = publish(article, options.output)
     print_article(article)

@@ -21,9 +21,11 @@ import numpy as np
 from dfsm.control import DirectTranscription, OptimalControlProblem, Solution, solve
 from dfsm.errors import DfsmError
 from dfsm.model import DFSM
+from dfsm.progress import track
 from dfsm.settings import require, settings
 from dfsm.trajectory import Trajectory
 from dfsm.types import Array
+from dfsm.workers import work_through
 
 # Channels of the turbine, in OpenFAST's words and units: kN m, deg, deg, rpm, m/s, kN, kN m.
 TORQUE, BLADE, PITCH, SPEED, WIND = "GenTq", "BldPitch1", "PtfmPitch", "GenSpeed", "RotWind"
@@ -393,7 +395,9 @@ def optimise(
     )
 
 
-def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> ControlStudy:
+def study(
+    regions: Sequence[Region], size: ControlStudySize | None = None, jobs: int = 1
+) -> ControlStudy:
     """Solve both cases for every wind series and every limit of the platform pitch.
 
     Parameters
@@ -402,22 +406,34 @@ def study(regions: Sequence[Region], size: ControlStudySize | None = None) -> Co
         Models and runs.
     size
         How much to compute; None is the paper's size.
+    jobs
+        Wind series at a time, each in a process of its own.
     """
     size = size or ControlStudySize()
-    begin, results = clock.perf_counter(), []
-    for region in regions:
-        own = turbine_case(region)
-        for wind in region.tests:
-            paper, free = (_limits(region, wind, case, size) for case in (PAPER, own))
-            results += [*paper, *free]
-            if size.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
-                results += _limits(region, wind, own, size, free)
+    begin = clock.perf_counter()
+    tasks = [(k, s) for k, region in enumerate(regions) for s in range(len(region.tests))]
+    found = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
+    results = [result for task in tasks for result in found[task]]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
         for key, model in models.items():
             gains[f"{region.name}, case {key}"] = steady_gains(model, region.wind)
     return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
+
+
+def _series(
+    shared: tuple[Sequence[Region], ControlStudySize], task: tuple[int, int]
+) -> list[Result]:
+    """All problems of one wind series, given by the numbers of its region and of its run there."""
+    regions, size = shared
+    region = regions[task[0]]
+    wind, own = region.tests[task[1]], turbine_case(region)
+    paper, free = (_limits(region, wind, case, size) for case in (PAPER, own))
+    results = [*paper, *free]
+    if size.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
+        results += _limits(region, wind, own, size, free)
+    return results
 
 
 def _limits(
