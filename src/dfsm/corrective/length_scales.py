@@ -35,7 +35,6 @@ def hyper_parameters(z: Array, targets: Array, seed: int) -> tuple[float, float,
 
     d = z.shape[1]
     lengths: Any = np.full(d, np.sqrt(d))
-    # A function that is nearly linear is a long piece of a high wave.
     kernel = kernels.ConstantKernel(0.5, (1e-4, 1e3)) * kernels.RBF(lengths, (0.2, 1e3))
     kernel = kernel + kernels.WhiteKernel(0.1, (1e-10, 1e2))
     with warnings.catch_warnings():
