@@ -97,9 +97,8 @@ class Transcription:
         self.functions = functions_of(problem)
         nodes = np.arange(len(grid.tau))
         places = grid.tau, nodes, grid.control_node
-        self.layout = Layout(problem, self.functions, *places, start, stay_inside)
-        known = problem.latent_paths(self.layout.time)
-        self.layout = replace(self.layout, known=known)
+        layout = Layout(problem, self.functions, *places, start, stay_inside)
+        self.layout = replace(layout, known=problem.latent_paths(layout.time))
         self.common = common_of(problem)
         self.program = self._program()
 
