@@ -45,6 +45,8 @@ _CLEARLY, _MOST_SCALE = 3.0, 1e4
 _NEAR = 1e-2
 # By which factor the bound on the distance from the training data is tightened at most.
 _TIGHTER = 4.0
+# Tolerance of what is solved on the way there.
+_ROUGHLY = 1e-4
 # Meshes are not refined beyond this many intervals.
 _MOST_INTERVALS = 5000
 
@@ -89,7 +91,7 @@ def solve(
         return _solution(*_inside(problem, method, guess), simulate)
     # The distance bends the feasible set: from the optimum without it the solver needs tens of
     # iterations, from a guess hundreds.
-    first = _solve_meshes(problem, _on_one_mesh(method), guess)
+    first = _solve_meshes(problem, _on_the_way(method), guess)
     free = _solution(problem, first, simulate=False)
     if not free.solved:
         return _solution(problem, first, simulate)
@@ -108,7 +110,7 @@ def _inside(
     steps = max(1, int(np.ceil(np.log(farthest) / np.log(_TIGHTER))))
     for step in range(1, steps):
         looser = _within(problem, farthest ** (1 - step / steps))
-        done = _solve_meshes(looser, _on_one_mesh(method), guess).after(done)
+        done = _solve_meshes(looser, _on_the_way(method), guess).after(done)
         if done.outcome.ending == "interrupted":
             return looser, done
         guess = _solution(looser, done, simulate=False)
@@ -116,8 +118,9 @@ def _inside(
     return inside, _solve_meshes(inside, method, guess).after(done)
 
 
-def _on_one_mesh(method: Method) -> Method:
-    """The method for what is solved on the way: only the last mesh is worth refining."""
+def _on_the_way(method: Method) -> Method:
+    """The method for what only starts the next solve: on one mesh, and not to the last digit."""
+    method = replace(method, tolerance=max(method.tolerance, _ROUGHLY))
     return replace(method, refine=None) if isinstance(method, DirectTranscription) else method
 
 
