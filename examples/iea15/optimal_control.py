@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import demo  # its neighbour
 
 import dfsm
 from dfsm.console import print_article
+from dfsm.errors import hushed
 from dfsm.report.publish import publish
 from dfsm.report.turbine_control import control_article
 from dfsm.studies.turbine_control import ControlStudy, Region, study
@@ -52,8 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> ControlStudy:
         parser.error(
             f"{options.models} holds no model '{missing[0]}': run examples/iea15/demo.py first"
         )
-    with dfsm.show_progress(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", dfsm.DfsmWarning)  # they stand in the tables
+    with dfsm.show_progress(), hushed():  # what they say stands in the tables
         found = study(regions(options.models), jobs=processors())
     article = control_article(found)
     written = publish(article, options.output)
