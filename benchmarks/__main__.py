@@ -28,7 +28,7 @@ from benchmarks import (
     scaling,
     speed,
 )
-from dfsm.files import json_value
+from dfsm.core.files import json_value
 
 PARTS = {
     "derivatives": derivatives.run,

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-from functools import cache
-from pathlib import Path
+import importlib
 from types import ModuleType
 from typing import Any
 
-DEMO = Path(__file__).parents[1] / "examples" / "iea15" / "demo.py"
 
-
-@cache
 def demo() -> ModuleType:
     """The demo as a module."""
-    spec = importlib.util.spec_from_file_location("iea15_demo", DEMO)
-    if spec is None or spec.loader is None:
-        raise FileNotFoundError(DEMO)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module("demo")
 
 
 def run(*labels: str) -> dict[str, Any]:

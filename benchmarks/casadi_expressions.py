@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from dfsm.control import OptimalControlProblem
-from dfsm.corrective import GaussianUnits
-from dfsm.model import DFSM
+from dfsm.models.corrective import GaussianUnits
+from dfsm.models.dfsm import DFSM
 
 
 def solve_with_expressions(

@@ -1,10 +1,11 @@
-"""Optimisation on surrogates where the true optimum is known: co-design, and the adaptive loop."""
+"""Optimization on surrogates where the true optimum is known: co-design, and the adaptive loop."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from dfsm.studies import adaptive_robot, codesign
+import adaptive_robot
+import codesign
 
 SEEDS = (0, 1, 2)
 

@@ -21,13 +21,14 @@ from dfsm.control import (
     Solution,
     solve,
 )
-from dfsm.control.schemes import Kind
-from dfsm.corrective import GaussianUnits
-from dfsm.derivatives import DerivativeSettings, StateSpec
-from dfsm.linear import LinearModel
-from dfsm.model import DFSM
-from dfsm.signals import Region, SignalTable
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.control.mesh.schemes import Kind
+from dfsm.data.derivatives import DerivativeSettings, StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.models.corrective import GaussianUnits
+from dfsm.models.dfsm import DFSM
+from dfsm.models.linear import LinearModel
+from dfsm.models.region import Region
+from dfsm.models.signals import SignalTable
 
 # Solves of which the fastest is timed.
 REPEATS = 3

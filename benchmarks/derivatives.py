@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import UnivariateSpline
 
-from dfsm.derivatives import cubic_spline, smoothing_spline
+from dfsm.core.types import Array
+from dfsm.data.derivatives import cubic_spline, smoothing_spline
+from dfsm.data.readers import read
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.read import read
-from dfsm.trajectory import Trajectory
-from dfsm.types import Array
 
 START = 100.0  # s, the start-up transient before it is left out
 Derivatives = tuple[Array, Array]

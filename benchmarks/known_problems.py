@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.control import OptimalControlProblem
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.simulators import ODESystem, two_link_robot
-from dfsm.trajectory import Channel, Trajectory
 
 
 @dataclass(frozen=True)

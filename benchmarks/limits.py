@@ -22,8 +22,8 @@ import numpy as np
 import dfsm
 from benchmarks.accuracy import demo
 from benchmarks.rollouts import errors, low_passed, uncorrected
-from dfsm.rollout_error import record_of
-from dfsm.types import Array
+from dfsm.core.types import Array
+from dfsm.refinement.rollout_error import record_of
 
 SEEDS = (2, 4)  # training seeds per wind speed, instead of eight
 UNITS = (0, 16, 32)  # of the network

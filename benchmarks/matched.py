@@ -19,7 +19,7 @@ import numpy as np
 import dfsm
 from benchmarks.accuracy import demo
 from benchmarks.rollouts import STATES, errors, low_passed, recorded
-from dfsm.types import Array
+from dfsm.core.types import Array
 
 CORRELATIONS = (0.0, 0.8)
 SLOW = 0.15  # Hz, for derivatives of differences

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import dfsm
+from dfsm.core.types import Array
 from dfsm.simulators.two_link_robot import holding_torques
-from dfsm.types import Array
 
 # Masses in kg by where they lie to the trained ones.
 MASSES = {

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 import dfsm
 from benchmarks.accuracy import demo
 from benchmarks.rollouts import STATES, judged
-from dfsm.types import Array
+from dfsm.core.types import Array
 
 NAME = "jax-sysid, 6 states, 16 units (a general peer)"
 SCRIPT = Path(__file__).with_name("jax_sysid_peer.py")

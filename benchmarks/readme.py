@@ -276,7 +276,7 @@ def sweep_table(figures: Mapping[str, Any]) -> list[str]:
 
 
 def codesign_table(figures: Mapping[str, Any]) -> list[str]:
-    """A line per seed of the plant-and-control optimisation."""
+    """A line per seed of the plant-and-control optimization."""
     lines = [
         "| seed | runs | best m2, surrogate / truth | cost, surrogate / truth | this m2 costs "
         "more by | arm misses its end by |",

@@ -6,8 +6,8 @@ python -m benchmarks.robot     # takes as long as dfsm demo two-link-robot
 from __future__ import annotations
 
 from benchmarks.readme import ROOT, fill
-from dfsm.report.robot import robot_article
-from dfsm.studies.two_link_robot import study
+from dfsm.demos.two_link_robot.article import robot_article
+from dfsm.demos.two_link_robot.study import study
 
 PAGE = ROOT / "docs" / "two-link-robot.md"
 

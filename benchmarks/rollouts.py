@@ -19,12 +19,12 @@ from scipy.signal import butter, sosfiltfilt
 
 import dfsm
 from benchmarks.accuracy import demo
-from dfsm.derivatives import differentiate
-from dfsm.fatigue import damage_equivalent_load
-from dfsm.read.wind import CORRECTED_WIND
-from dfsm.spectra import Band, Spectrum, spectrum
-from dfsm.types import Array
-from dfsm.validate import LOW, PLATFORM, WAVE
+from dfsm.core.types import Array
+from dfsm.data.derivatives import differentiate
+from dfsm.data.wind import CORRECTED_WIND
+from dfsm.numerics.fatigue import damage_equivalent_load
+from dfsm.numerics.spectra import Band, Spectrum, spectrum
+from dfsm.validation.validate import LOW, PLATFORM, WAVE
 
 WINDS = ("06mps", "12mps", "18mps")
 STATES = ("PtfmPitch", "PtfmPitch_dot", "GenSpeed")

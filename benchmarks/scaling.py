@@ -19,12 +19,12 @@ import numpy as np
 
 import dfsm
 from benchmarks.speed import best
-from dfsm.corrective import CorrectiveChoice
-from dfsm.types import Array
+from dfsm.core.types import Array
+from dfsm.fitting.corrective import CorrectiveSettings
 
 MASSES = (2, 4, 8, 16)
 LINEAR = "linear fit"
-KINDS: dict[str, CorrectiveChoice] = {
+KINDS: dict[str, CorrectiveSettings] = {
     "rbf, equal": dfsm.RBF(directions="equal"),
     "rbf, per_input": dfsm.RBF(),
     "rbf_incremental": dfsm.IncrementalRBF(),
@@ -42,7 +42,7 @@ def run() -> dict[str, Any]:
     return {str(masses): chain(masses) for masses in MASSES}
 
 
-def chain(masses: int, kinds: Mapping[str, CorrectiveChoice] = KINDS) -> dict[str, Any]:
+def chain(masses: int, kinds: Mapping[str, CorrectiveSettings] = KINDS) -> dict[str, Any]:
     """Figures of the linear fit and of every kind for one chain."""
     system = dfsm.mass_chain(masses)
     runs = system.campaign(
@@ -76,7 +76,7 @@ def chain(masses: int, kinds: Mapping[str, CorrectiveChoice] = KINDS) -> dict[st
     return {"inputs": 3 * masses, "samples": sum(map(len, train)), "results": results}
 
 
-def settings(masses: int, kind: CorrectiveChoice) -> dfsm.FitSettings:
+def settings(masses: int, kind: CorrectiveSettings) -> dfsm.FitSettings:
     """Positions and recorded velocities as states, one force per mass."""
     order = range(1, masses + 1)
     return dfsm.FitSettings(

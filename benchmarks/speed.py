@@ -21,9 +21,9 @@ from scipy.integrate import solve_ivp
 
 import dfsm
 from benchmarks.accuracy import demo
-from dfsm.corrective.functions import GaussianUnits
-from dfsm.linear import fit_linear
-from dfsm.model import DFSM
+from dfsm.fitting.linear import fit_linear
+from dfsm.models.corrective import GaussianUnits
+from dfsm.models.dfsm import DFSM
 
 DATA = Path(__file__).parents[1] / "examples" / "iea15"
 UNITS = 200

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import dfsm
-from dfsm.console import print_article
+from dfsm.cli.tables import print_article
+from dfsm.demos.two_link_robot import study as two_link_robot
+from dfsm.demos.two_link_robot.article import robot_article
 from dfsm.report.publish import publish
-from dfsm.report.robot import robot_article
-from dfsm.studies import two_link_robot
 
 
 def main(arguments: Sequence[str] | None = None) -> two_link_robot.RobotStudy:

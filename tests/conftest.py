@@ -18,8 +18,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from dfsm import cli
-from dfsm.read import write_table
-from dfsm.trajectory import Trajectory
+from dfsm.data.readers.tables import write_table
+from dfsm.data.trajectory import Trajectory
 from outb import write_outb
 from systems import DUFFING
 

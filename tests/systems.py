@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from dfsm.corrective import GaussianUnits
-from dfsm.derivatives import DerivativeSettings, StateSpec
-from dfsm.linear import LinearModel
-from dfsm.model import DFSM
-from dfsm.signals import Azimuth, Region, SignalTable
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.data.derivatives import DerivativeSettings, StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.models.corrective import GaussianUnits
+from dfsm.models.dfsm import DFSM
+from dfsm.models.linear import LinearModel
+from dfsm.models.region import Region
+from dfsm.models.signals import Azimuth, SignalTable
 
 Signal = Callable[[np.ndarray], np.ndarray]
 Right = Callable[[np.ndarray, np.ndarray], np.ndarray]

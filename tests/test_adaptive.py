@@ -1,4 +1,4 @@
-"""Optimisation on surrogates where the truth is known: the adaptive loop, and co-design."""
+"""Optimization on surrogates where the truth is known: the adaptive loop, and co-design."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import adaptive_robot
+import codesign
 import dfsm
 from conftest import example_module
-from dfsm.control import Agreement, DirectTranscription, realised
-from dfsm.studies import adaptive_robot, codesign
+from dfsm.control import DirectTranscription
+from dfsm.loops.adaptive import Agreement, realised
 
 METHOD = DirectTranscription(mesh=20, refine=None)
 TIME = np.linspace(0, 2, 101)
@@ -87,7 +89,7 @@ def truth():
 def test_the_loop_finds_the_optimum_of_the_true_system(truth):
     options = dfsm.AdaptiveSettings(method=METHOD, most_rounds=8)
     runs = first_runs()
-    result = dfsm.optimise_adaptively(
+    result = dfsm.optimize_adaptively(
         runs, fitted(dfsm.GP(samples=60)), problem, simulated, options
     )
     assert result.status is Agreement.AGREED, result.summary()
@@ -106,7 +108,7 @@ def test_the_loop_finds_the_optimum_of_the_true_system(truth):
 
 def test_a_surrogate_that_cannot_know_better_is_said_not_to_agree():
     options = dfsm.AdaptiveSettings(method=METHOD, most_rounds=2)
-    result = dfsm.optimise_adaptively(
+    result = dfsm.optimize_adaptively(
         first_runs(), fitted(dfsm.NoCorrection()), problem, simulated, options
     )
     assert result.status is Agreement.LIMIT
@@ -117,7 +119,7 @@ def test_a_surrogate_that_cannot_know_better_is_said_not_to_agree():
 
 def test_a_problem_without_a_feasible_point_is_said_to_be():
     options = dfsm.AdaptiveSettings(method=METHOD, most_rounds=1)
-    result = dfsm.optimise_adaptively(
+    result = dfsm.optimize_adaptively(
         first_runs(),
         fitted(dfsm.NoCorrection()),
         lambda model: problem(model, bounds={"torque": (-0.01, 0.01)}),
@@ -185,7 +187,7 @@ def test_the_arm_of_the_codesign_study():
 
 
 def test_mass_and_torques_on_a_small_surrogate():
-    size = codesign.CodesignSize(runs=6, masses=3)
+    size = codesign.CodesignSettings(runs=6, masses=3)
     runs = codesign.training_runs(size, 0)
     assert len(runs) == 18
     assert {float(r["m2"][0]) for r in runs} == {2.0, 2.5, 3.0}
@@ -196,12 +198,12 @@ def test_mass_and_torques_on_a_small_surrogate():
 
 
 def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
-    example = example_module("robot_codesign")
-    arm = codesign.CodesignSize(runs=4, masses=3, corrective=dfsm.GP(samples=40))
-    turn = adaptive_robot.AdaptiveSize(
+    example = example_module("robot/study")
+    arm = codesign.CodesignSettings(runs=4, masses=3, corrective=dfsm.GP(samples=40))
+    turn = adaptive_robot.AdaptiveRobotSettings(
         runs=4,
         corrective=dfsm.GP(samples=40),
-        options=dfsm.AdaptiveSettings(most_rounds=1, method=adaptive_robot.METHOD),
+        settings=dfsm.AdaptiveSettings(most_rounds=1, method=adaptive_robot.METHOD),
     )
     monkeypatch.setattr(codesign, "CodesignSize", lambda: arm)
     monkeypatch.setattr(adaptive_robot, "AdaptiveSize", lambda: turn)

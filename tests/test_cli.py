@@ -19,10 +19,11 @@ from ruamel.yaml import YAML
 
 from conftest import changed, files_of, renamed, write_config
 from dfsm import fit as fit_function
-from dfsm.config import load_config, parse_config
+from dfsm.config.fit import load_config, parse_config
+from dfsm.data.readers import read
+from dfsm.data.readers.tables import write_table
 from dfsm.errors import DfsmWarning
-from dfsm.read import read, write_table
-from dfsm.storage import load
+from dfsm.models.model_folder import load
 
 CONSOLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f]")
 SCRIPT = Path(sys.executable).with_name("dfsm")
@@ -384,7 +385,7 @@ def test_a_bug_exits_with_3_and_says_so(here, dfsm, monkeypatch):
     def broken(path):
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("dfsm.storage.load", broken)
+    monkeypatch.setattr("dfsm.models.model_folder.load", broken)
     shown = dfsm("summary", "m")
     assert shown.code == 3
     assert shown.err.splitlines()[0] == "bug in dfsm: ZeroDivisionError: division by zero"
@@ -399,9 +400,9 @@ def test_ctrl_c_leaves_nothing_half_written(here, dfsm, monkeypatch, command):
         raise KeyboardInterrupt
 
     if command == "fit":
-        monkeypatch.setattr("dfsm.samples.differentiate", interrupt)
+        monkeypatch.setattr("dfsm.fitting.samples.differentiate", interrupt)
     else:
-        monkeypatch.setattr("dfsm.bundle.json_bytes", interrupt)
+        monkeypatch.setattr("dfsm.core.bundle.json_bytes", interrupt)
     before = files_of(here)
     shown = dfsm("fit", "c.yaml", "-o", "m")
     assert (shown.code, shown.out) == (130, "")

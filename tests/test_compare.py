@@ -18,15 +18,16 @@ from ruamel.yaml import YAML
 
 import dfsm as package
 from conftest import changed, files_of, write_config
-from dfsm.compare import Candidate, compare
-from dfsm.config import parse_candidates, parse_config
-from dfsm.corrective import GP, NoCorrection
-from dfsm.derivatives import StateSpec
+from dfsm.config.fit import parse_candidates, parse_config
+from dfsm.config.template import write_config as write_template
+from dfsm.data.derivatives import StateSpec
 from dfsm.errors import DfsmError
-from dfsm.linear import LPV, LTI
-from dfsm.samples import FitSettings
-from dfsm.storage import load
-from dfsm.template import write_config as write_template
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.model_folder import load
+from dfsm.selection.compare import Candidate, compare
 from systems import SCHEDULED
 
 LINEAR = Candidate(
@@ -121,7 +122,7 @@ def test_the_score_is_that_of_validate(runs, tmp_path):
 
 
 def test_one_that_diverges_comes_after_all_that_do_not(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules["dfsm.simulate"], "_ESCAPE", 1.5)
+    monkeypatch.setattr("dfsm.simulation.simulate._ESCAPE", 1.5)
     candidates = {"q": variant(states=(StateSpec(name="q"),)), "true": LINEAR}
     found = compare(candidates, runs, tmp_path / "c", validation=runs[:2], jobs=1)
     assert [c.status for c in found.candidates] == ["completed", "diverged"]
@@ -145,7 +146,7 @@ def test_what_has_not_changed_is_not_fitted_again(runs, tmp_path, monkeypatch):
         fitted.append(choices)
         return real(data, choices, refinement)
 
-    monkeypatch.setattr("dfsm.trial.fit", counted)
+    monkeypatch.setattr("dfsm.selection.trial.fit", counted)
     out, both = tmp_path / "c", {"a": LINEAR, "b": variant(linear=LTI())}
     first = compare(both, runs, out, jobs=1)
     before = files_of(out)

@@ -11,13 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import CONFIG, changed, write_config
-from dfsm.config import Config, load_config, parse_config
-from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
-from dfsm.derivatives import Filter, StateSpec
+from dfsm.config.fit import Config, load_config, parse_config
+from dfsm.data.derivatives import Filter, StateSpec
 from dfsm.errors import DfsmError
-from dfsm.linear import LPV, LTI
-from dfsm.samples import FitSettings
-from dfsm.signals import Azimuth
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.signals import Azimuth
 
 
 def parsed(tmp_path, content):

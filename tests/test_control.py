@@ -16,13 +16,13 @@ from dfsm.control import (
     OptimalControlProblem,
     SingleShooting,
     load_solution,
-    program,
     save_solution,
     solve,
 )
+from dfsm.control.nlp import program
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.simulators import ODESystem
-from dfsm.trajectory import Channel, Trajectory
 from systems import linear_model
 
 # A cart with drag, pushed by a force and by wind, with its mass as a parameter.
@@ -158,7 +158,7 @@ def test_free_final_time_with_rates_and_disturbances():
     assert found.replays[0].relative < 1e-3
 
 
-def test_plant_parameters_are_optimised():
+def test_plant_parameters_are_optimized():
     # Light carts need little force, but the mass must carry a load.
     free = problem(
         parameters={"mass": (0.5, 5.0)},

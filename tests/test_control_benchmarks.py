@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,11 +9,9 @@ import pytest
 from dfsm.control import DirectTranscription, solve
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import control, readme  # noqa: E402
-from benchmarks.casadi_expressions import solve_with_expressions  # noqa: E402
-from benchmarks.known_problems import PROBLEMS  # noqa: E402
+from benchmarks import control, readme
+from benchmarks.casadi_expressions import solve_with_expressions
+from benchmarks.known_problems import PROBLEMS
 
 
 def documented(name: str) -> list[list[str]]:

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.known_problems import PROBLEMS, Known
 from dfsm.control import DirectTranscription, MultipleShooting, SingleShooting, solve
 from dfsm.control.guess import start_of
-from dfsm.control.transcription import Transcription
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from benchmarks.known_problems import PROBLEMS, Known
+from dfsm.control.nlp.transcription import Transcription
 
 # One object per problem, so that all tests share its compiled functions.
 KNOWN: dict[str, Known] = {}

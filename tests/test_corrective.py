@@ -14,18 +14,14 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor, kernels
 
-from dfsm.corrective import (
-    GP,
-    MLP,
-    RBF,
-    CorrectiveFit,
-    GaussianUnits,
-    IncrementalRBF,
-    fit_corrective,
-)
-from dfsm.corrective.training import TrainingSet
 from dfsm.errors import DfsmError
-from dfsm.sampling import subsample
+from dfsm.fitting.corrective import fit_corrective
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
+from dfsm.fitting.corrective.training import CorrectiveFit, TrainingSet
+from dfsm.models.corrective import GaussianUnits
+from dfsm.numerics.sampling import subsample
 
 KINDS = {
     "rbf": RBF(samples=60),

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from dfsm.control import DirectTranscription, OptimalControlProblem, solve
-from dfsm.corrective import NoCorrection
-from dfsm.density import whiten
-from dfsm.derivatives import StateSpec
-from dfsm.fit import fit
-from dfsm.linear import LPV, LTI
-from dfsm.samples import FitSettings
-from dfsm.schedule import hats
-from dfsm.simulate import simulate
-from dfsm.storage import load, save
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.region import whiten
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.model_folder import load, save
+from dfsm.numerics.hats import hats
+from dfsm.simulation.simulate import simulate
 from systems import wander
 
 TIME = np.arange(0, 80.01, 0.1)

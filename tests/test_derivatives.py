@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from dfsm.derivatives import (
+from dfsm.data.derivatives import (
     DerivativeSettings,
     Filter,
     StateSpec,
@@ -16,9 +16,9 @@ from dfsm.derivatives import (
     state_names,
     state_units,
 )
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.filters import low_pass, moving_average
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.numerics.filters import low_pass, moving_average
 from motion import TIME, error, motion, quantised
 
 ROOT = Path(__file__).parents[1]

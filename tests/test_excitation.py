@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import periodogram
 
 from dfsm import Chirp, DfsmError, Multisine, RandomKnots, RandomSteps, Uniform, excite
-from dfsm.waveforms import held, interpolated
+from dfsm.simulators.waveforms import held, interpolated
 
 KINDS = [
     RandomKnots(low=-1.0, high=2.0, spacing=0.3),

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dfsm.corrective import NoCorrection
-from dfsm.derivatives import StateSpec
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.features import Feature, with_features
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.features import Feature, with_features
-from dfsm.fit import fit
-from dfsm.linear import LTI
-from dfsm.samples import FitSettings
-from dfsm.simulate import simulate
-from dfsm.storage import load, save
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.validate import validate
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.model_folder import load, save
+from dfsm.simulation.simulate import simulate
+from dfsm.validation.validate import validate
 
 RATE = Feature(source="w")
 LAG = Feature(source="w", kind="lag", time_constant=1.5)

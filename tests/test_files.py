@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from dfsm.core.files import write_file, write_folder
 from dfsm.errors import DfsmError
-from dfsm.files import write_file, write_folder
 
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dfsm.read import describe, read
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.data.info import describe
+from dfsm.data.readers import read
+from dfsm.data.trajectory import Channel, Trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 

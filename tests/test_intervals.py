@@ -8,18 +8,18 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from dfsm.calibrate import calibrate
-from dfsm.corrective import NoCorrection
-from dfsm.derivatives import StateSpec
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.fit import fit
-from dfsm.intervals import load_intervals
-from dfsm.linear import LPV, LTI
-from dfsm.samples import FitSettings
-from dfsm.signals import Provenance
-from dfsm.simulate import simulate
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.validate import validate
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.signals import Provenance
+from dfsm.simulation.simulate import simulate
+from dfsm.validation.calibrate import calibrate
+from dfsm.validation.intervals import load_intervals
+from dfsm.validation.validate import validate
 from systems import wander
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning")

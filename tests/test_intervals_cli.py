@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from conftest import files_of
-from dfsm.intervals import load_intervals
-from dfsm.read import read, write_table
+from dfsm.data.readers import read
+from dfsm.data.readers.tables import write_table
+from dfsm.validation.intervals import load_intervals
 from systems import DUFFING
 
 

@@ -11,20 +11,24 @@ import pytest
 from scipy.signal import lsim
 
 from dfsm.control import DirectTranscription, OptimalControlProblem, solve
-from dfsm.corrective import GP, MLP, RBF, GaussianUnits, NoCorrection, Perceptron
-from dfsm.derivatives import StateSpec
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.fit import fit
-from dfsm.latents import Poles, as_states, evolve, latent_path, poles
-from dfsm.linear import LPV, LTI, fit_linear
-from dfsm.parametrise import Parametrisation
-from dfsm.refine import RefineSettings, refine
-from dfsm.rollout_error import ErrorWeights, RolloutError, record_of
-from dfsm.samples import FitSettings
-from dfsm.simulate import Status, initial_state, simulate
-from dfsm.storage import load, load_all, save
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.validate import compared, validate
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LPV, LTI, fit_linear
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.corrective import GaussianUnits, Perceptron
+from dfsm.models.latents import Poles, as_states, evolve, latent_path, poles
+from dfsm.models.model_folder import load, load_all, save
+from dfsm.refinement.parameters import Parametrization
+from dfsm.refinement.refine import RefineSettings, refine
+from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.simulation.simulate import Status, initial_state, simulate
+from dfsm.validation.validate import compared, validate
 from systems import DUFFING, wander
 
 TIME = np.arange(0, 60.01, 0.1)
@@ -174,7 +178,7 @@ def test_everything_else_takes_them(model, tmp_path, runs):
 
 
 def test_an_optimum_starts_from_what_went_before(model):
-    """Latent states are no choice of the optimiser where a run tells them."""
+    """Latent states are no choice of the optimizer where a run tells them."""
     run = driven(98)
     cost = {"horizon": (START, 30.0), "cost": lambda s: s.x.q**2 + s.u.u**2}
     problem = OptimalControlProblem(model=model, disturbances=run, **cost)
@@ -203,7 +207,7 @@ def test_slopes_written_out_are_those_of_the_model(model, kind):
         "none": None,
     }[kind]
     full = replace(model, e=e, corrected=() if e is None else (0,))
-    parameters = Parametrisation.of(full, np.array([0.7]))
+    parameters = Parametrization.of(full, np.array([0.7]))
     at = jnp.asarray(0.1 * rng.normal(size=parameters.size))
     for _ in range(3):
         point = jnp.asarray(rng.normal(size=inputs))
@@ -223,7 +227,7 @@ def test_slopes_written_out_are_those_of_the_model(model, kind):
 @pytest.mark.parametrize("length", [5.0, None])  # less than a block of steps, and some and a rest
 def test_sensitivities_agree_with_differences(model, runs, length):
     record = record_of(model, runs[0], 0.2, START, 40.0)
-    parameters = Parametrisation.of(model, np.array([0.7]))
+    parameters = Parametrization.of(model, np.array([0.7]))
     problem = RolloutError(parameters, [[record]], length, ErrorWeights(np.ones(1)))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)

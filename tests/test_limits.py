@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,8 @@ from scipy.signal import butter, sosfiltfilt
 import dfsm
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import limits, matched, readme  # noqa: E402
-from benchmarks.accuracy import demo  # noqa: E402
+from benchmarks import limits, matched, readme
+from benchmarks.accuracy import demo
 
 
 def test_the_thrust_is_that_of_the_run():

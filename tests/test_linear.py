@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dfsm.errors import DfsmError
-from dfsm.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
 
 NAMES = ["torque", "pitch", "wind", "x3"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import warnings
 from dataclasses import replace
@@ -12,17 +11,19 @@ import jax
 import numpy as np
 import pytest
 
-from dfsm.corrective import GP, RBF, NoCorrection
-from dfsm.derivatives import StateSpec
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.fit import FitResult, fit
-from dfsm.linear import LPV, LTI
-from dfsm.model import DFSM
-from dfsm.samples import FitSettings
-from dfsm.signals import Azimuth, blade_harmonics
-from dfsm.simulate import Status, simulate
-from dfsm.steady import steady_state
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.rbf import RBF
+from dfsm.fitting.fit import FitResult, fit
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.dfsm import DFSM
+from dfsm.models.signals import Azimuth, blade_harmonics
+from dfsm.models.steady import steady_state
+from dfsm.simulation.simulate import Status, simulate
 from systems import (
     DUFFING,
     OSCILLATOR,
@@ -254,7 +255,7 @@ def test_harmonics_average_to_zero_where_the_azimuth_is_not_given():
     )
 
 
-# -- linearisation, equilibria ------------------------------------------------------------------
+# -- linearization, equilibria ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("which", ["duffing", "scheduled"])
@@ -482,7 +483,7 @@ def test_a_correction_that_is_not_worthwhile(duffing_runs, monkeypatch, share, t
     def trained(inputs, residuals, *_):
         return SimpleNamespace(explained=np.full(residuals.shape[1], share), detail="")
 
-    monkeypatch.setattr(importlib.import_module("dfsm.correction"), "fit_corrective", trained)
+    monkeypatch.setattr("dfsm.fitting.gate.fit_corrective", trained)
     choices = replace(LINEAR, states=SECOND, outputs=("y", "z"), nonlinear_only=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DfsmWarning)

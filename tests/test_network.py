@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dfsm.corrective.levenberg_marquardt import Step, levenberg_marquardt
-from dfsm.corrective.network import NetworkError, evaluate, layers
+from dfsm.fitting.corrective.network import NetworkError, evaluate, layers
+from dfsm.numerics.levenberg_marquardt import Step, levenberg_marquardt
 
 SIZES = [(3, 4, 2), (3, 4, 5, 2), (2, 3, 3, 3, 1), (1, 1, 6)]
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from conftest import Dfsm, write_config
+from dfsm.config.control import CostTerm, cost_of
 from dfsm.control import load_solution
-from dfsm.control.signals import Signals, plant_of
-from dfsm.control_config import CostTerm, cost_of
-from dfsm.read import write_table
-from dfsm.storage import save
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.control.names import Signals, plant_of
+from dfsm.data.readers.tables import write_table
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.models.model_folder import save
 from systems import linear_model
 
 # ẋ = −x + u, y = 2 x.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +14,14 @@ import pytest
 
 import dfsm
 from conftest import write_config
-from dfsm.config import parse_config
-from dfsm.read import read, write_table
+from dfsm.config.fit import parse_config
+from dfsm.data.readers import read
+from dfsm.data.readers.tables import write_table
 from dfsm.simulators.two_link_robot import holding_torques
 from systems import SPRING
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import parameters, readme  # noqa: E402
+from benchmarks import parameters, readme
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*linear fit is unstable:dfsm.errors.DfsmWarning")
 
@@ -128,10 +126,10 @@ def test_runs_with_different_masses_together_and_one_by_one(models, tests):
 def test_the_mass_drives_every_solver(models, tests, method):
     options = dfsm.SimulationSettings(method=method)
     light, heavy = (
-        dfsm.simulate(models[TOLD], with_mass(tests[1], mass), options=options).trajectory
+        dfsm.simulate(models[TOLD], with_mass(tests[1], mass), settings=options).trajectory
         for mass in (2.1, 2.9)
     )
-    own = dfsm.simulate(models[TOLD], tests[1], options=options).trajectory
+    own = dfsm.simulate(models[TOLD], tests[1], settings=options).trajectory
     error = np.abs(own["theta1"] - tests[1]["theta1"]).max()
     assert 20 * error < np.abs(light["theta1"] - heavy["theta1"]).max()
 

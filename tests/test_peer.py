@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import dfsm
-from dfsm.files import json_value
+from dfsm.core.files import json_value
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import peer, readme  # noqa: E402
-from benchmarks.accuracy import demo  # noqa: E402
-from benchmarks.rollouts import judged  # noqa: E402
+from benchmarks import peer, readme
+from benchmarks.accuracy import demo
+from benchmarks.rollouts import judged
 
 START = round(peer.WARM_UP / peer.STEP)
 

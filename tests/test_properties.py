@@ -12,13 +12,15 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from dfsm.corrective import GP, MLP, RBF
-from dfsm.derivatives import StateSpec
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmWarning
-from dfsm.fit import fit
-from dfsm.model import DFSM
-from dfsm.samples import FitSettings
-from dfsm.trajectory import Trajectory
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF
+from dfsm.fitting.fit import fit
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.dfsm import DFSM
 from systems import DUFFING
 
 KINDS = {

@@ -11,8 +11,10 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from dfsm.data.readers import read, read_all
+from dfsm.data.readers.openfast import read_openfast
+from dfsm.data.wind import undisturbed_rotor_wind, wind_warning
 from dfsm.errors import DfsmError
-from dfsm.read import read, read_all, read_openfast, undisturbed_rotor_wind, wind_warning
 from outb import encode, outb_bytes, smooth_run, write_outb
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"

@@ -15,9 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from dfsm.data.readers import read
+from dfsm.data.readers.openfast import read_openfast
+from dfsm.data.readers.tables import read_table, write_table
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.read import read, read_openfast, read_table, write_table
-from dfsm.trajectory import Channel, Trajectory
 from outb import smooth_run, write_outb
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"

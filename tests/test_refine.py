@@ -14,20 +14,21 @@ import pytest
 from scipy.signal import lsim
 
 from conftest import changed, write_config
-from dfsm.corrective import GaussianUnits, NoCorrection, Perceptron
-from dfsm.derivatives import StateSpec
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
-from dfsm.fit import fit
-from dfsm.linear import LTI
-from dfsm.parametrise import Parametrisation
-from dfsm.refine import RefineSettings, refine
-from dfsm.refine_stability import StabilityKept
-from dfsm.refine_start import start_network
-from dfsm.rollout_error import ErrorWeights, RolloutError, record_of
-from dfsm.samples import FitSettings
-from dfsm.simulate import simulate
-from dfsm.storage import load
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.corrective import GaussianUnits, Perceptron
+from dfsm.models.model_folder import load
+from dfsm.refinement.growth import StabilityKept
+from dfsm.refinement.parameters import Parametrization
+from dfsm.refinement.refine import RefineSettings, refine
+from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.start import start_network
+from dfsm.simulation.simulate import simulate
 from systems import OSCILLATOR_A, linear_model, wander
 
 TIME = np.arange(0, 60.01, 0.05)
@@ -97,7 +98,7 @@ def test_the_runs_held_out_train_at_last(runs, biased):
     assert 0 < stages.count(2) <= stages.count(1)
     assert all(("validation" in entry) == (entry["stage"] < 2) for entry in result.history)
     records = [record_of(biased, run, CHOICES.step, None, None) for run in runs]
-    parameters = Parametrisation.of(result.model, np.ones(2))
+    parameters = Parametrization.of(result.model, np.ones(2))
     everything = RolloutError(parameters, [[r] for r in records], None, ErrorWeights(np.ones(2)))
     error = everything.relative(np.zeros(parameters.size))
     assert result.history[-1]["training"] == pytest.approx(error, rel=1e-9)
@@ -116,7 +117,7 @@ def test_the_true_model_is_not_made_worse():
 
 def test_correlated_errors_count_as_in_generalised_least_squares(runs, biased):
     rho, count = 0.7, 3
-    parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
+    parameters = Parametrization.of(biased, np.array([1.0, 3.0]))
     at = np.zeros(parameters.size)
     records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:count]]
     spread = np.sqrt(np.mean([r.states.var(axis=0) for r in records], axis=0))
@@ -174,7 +175,6 @@ def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monk
     def nothing(problem, start, penalty):
         return iter(())
 
-    # By module: `dfsm.refine` is also the function, once somebody has asked the package for it.
     monkeypatch.setattr(sys.modules[refine.__module__], "levenberg_marquardt", nothing)
     with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
         result = refine(biased, runs, CHOICES)
@@ -194,7 +194,7 @@ def test_the_seed_decides_which_runs_are_held_out(runs, biased):
 @pytest.mark.parametrize("size", [1, 3])  # of a group of runs with correlated errors
 def test_slopes_agree_with_differences(runs, biased, size):
     records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:size]]
-    parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
+    parameters = Parametrization.of(biased, np.array([1.0, 3.0]))
     problem = RolloutError(parameters, [records], 5.0, ErrorWeights(np.ones(2), 0.7))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     JtJ, Jtr = problem.normal_equations(at)
@@ -210,7 +210,7 @@ def test_slopes_agree_with_differences(runs, biased, size):
 def test_curvature_is_that_of_all_steps(runs, biased, length, rel):
     """Exactly in short windows; in long ones every fourth step stands for all."""
     records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:2]]
-    parameters = Parametrisation.of(biased, np.array([1.0, 3.0]))
+    parameters = Parametrization.of(biased, np.array([1.0, 3.0]))
     problem = RolloutError(parameters, [records], length, ErrorWeights(np.ones(2)))
     at, eps = 0.01 * np.random.default_rng(0).normal(size=parameters.size), 1e-5
     errors = sys.modules[RolloutError.__module__]._errors
@@ -234,7 +234,7 @@ def test_growth_adds_to_the_cost_with_exact_slopes(runs, biased, network):
     model = replace(biased, f=replace(biased.f, coefficients=L))
     if network:
         model = start_network(model, network, np.array([1.0, 3.0]), 0)
-    parameters = Parametrisation.of(model, np.array([1.0, 3.0]))
+    parameters = Parametrization.of(model, np.array([1.0, 3.0]))
     kept = StabilityKept(parameters, 1000)
     rng, eps = np.random.default_rng(0), 1e-6
     draws = (1e-4 * rng.normal(size=parameters.size) for _ in range(200))
@@ -250,7 +250,7 @@ def test_growth_adds_to_the_cost_with_exact_slopes(runs, biased, network):
 def test_growth_of_a_start_that_is_unstable_is_left_alone(biased):
     L = biased.f.coefficients.at[0, 1, 2].set(0.2)
     unstable = replace(biased, f=replace(biased.f, coefficients=L))
-    kept = StabilityKept(Parametrisation.of(unstable, np.array([1.0, 3.0])), 1000)
+    kept = StabilityKept(Parametrization.of(unstable, np.array([1.0, 3.0])), 1000)
     zero = np.zeros(4)
     assert kept.cost(zero) == 0
     assert not kept.normal_equations(zero)[0].any()
@@ -295,7 +295,7 @@ def test_deviations_change_what_they_should(kind):
     if kind != "none":
         e = units if kind == "units" else network
         model = replace(model, e=e, corrected=(1,))
-    parameters = Parametrisation.of(model, np.array([1.0, 2.0]))
+    parameters = Parametrization.of(model, np.array([1.0, 2.0]))
     extra = {"units": 5, "perceptron": 21, "none": 0}[kind]
     assert parameters.size == 2 * 4 + extra
     point = jnp.array([0.3, -0.2]), jnp.array([0.7]), jnp.zeros(0)

@@ -12,21 +12,21 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from dfsm.console import print_validations
-from dfsm.corrective import RBF
-from dfsm.derivatives import StateSpec
+from dfsm.cli.tables import print_validations
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.fit import fit
-from dfsm.intervals import Intervals
-from dfsm.linear import LTI
+from dfsm.fitting.corrective.rbf import RBF
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LTI
+from dfsm.fitting.settings import FitSettings
 from dfsm.report import write_report
 from dfsm.report.document import embed
 from dfsm.report.elements import element, number
 from dfsm.report.figures import thin
-from dfsm.samples import FitSettings
-from dfsm.simulate import Status
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.validate import compared, validate
+from dfsm.simulation.simulate import Status
+from dfsm.validation.intervals import Intervals
+from dfsm.validation.validate import compared, validate
 
 STATE = "</script><img src=x onerror=alert(1)>"
 OUTPUT = "<b>x</b>"

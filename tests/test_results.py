@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
+from dfsm.demos.two_link_robot.article import beyond_section, extraction_section, taylor_section
+from dfsm.demos.two_link_robot.defaults import DEFAULT, KINDS, PEER, fit_kinds
+from dfsm.demos.two_link_robot.extraction import ExtractionSettings, extraction
+from dfsm.demos.two_link_robot.multi_fidelity import TEST_RUNS, TRAINING_RUNS, draw
+from dfsm.demos.two_link_robot.study import LONG_SEED
+from dfsm.demos.two_link_robot.taylor import TaylorSettings, compare_with_taylor
 from dfsm.report.article import Table
-from dfsm.report.robot import beyond_section, extraction_section, taylor_section
-from dfsm.studies.defaults import DEFAULT, KINDS, PEER, fit_kinds
-from dfsm.studies.extraction import ExtractionSize, extraction
-from dfsm.studies.multi_fidelity import TEST_RUNS, TRAINING_RUNS, draw
-from dfsm.studies.taylor import TaylorSize, compare_with_taylor
-from dfsm.studies.two_link_robot import LONG_SEED
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import accuracy, derivatives, readme  # noqa: E402
+from benchmarks import accuracy, derivatives, readme
 
 ROBOT = "docs/two-link-robot.md"
 
@@ -93,13 +90,13 @@ def assert_stated(found: Table, rel: float) -> None:
 
 
 def test_robot_derivatives() -> None:
-    durations, orders = extraction_section(extraction(ExtractionSize(), seed=0)).tables
+    durations, orders = extraction_section(extraction(ExtractionSettings(), seed=0)).tables
     assert_stated(durations, 0.1)
     assert_stated(orders, 0.1)
 
 
 def test_robot_poles_and_decisions() -> None:
-    poles, gate = taylor_section(compare_with_taylor(TaylorSize(), seed=0)).tables
+    poles, gate = taylor_section(compare_with_taylor(TaylorSettings(), seed=0)).tables
     assert_stated(poles, 1e-3)
     # Residuals of linear rows are rounding errors.
     assert [row[2] for row in table("gate", ROBOT)[1:]] == [row[2] for row in gate.texts()]

@@ -17,12 +17,12 @@ from dfsm.control import (
     save_solution,
     solve,
 )
+from dfsm.data.readers.tables import write_table
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.export import write_rosco
-from dfsm.fatigue import damage_equivalent_load
-from dfsm.read import write_table
+from dfsm.exports.rosco import write_rosco
+from dfsm.numerics.fatigue import damage_equivalent_load
 from dfsm.simulators import ODESystem
-from dfsm.trajectory import Channel, Trajectory
 
 MOST = 7.56  # rpm
 

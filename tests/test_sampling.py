@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from dfsm.errors import DfsmError
-from dfsm.sampling import subsample
+from dfsm.numerics.sampling import subsample
 
 METHODS = ("kmeans", "maxmin", "random")
 

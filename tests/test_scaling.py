@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks import readme, scaling  # noqa: E402
+from benchmarks import readme, scaling
 
 # One of ten test runs is swung further than the training runs usually are.
 pytestmark = pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning")

@@ -13,12 +13,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
-from dfsm import integrate
-from dfsm.corrective import GaussianUnits
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.signals import Azimuth
-from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
-from dfsm.trajectory import Channel, Trajectory
+from dfsm.models.corrective import GaussianUnits
+from dfsm.models.signals import Azimuth
+from dfsm.simulation import integrate
+from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
 from systems import OSCILLATOR_A, driving_run, linear_model, wander
 
 B = np.array([[0.0], [2.0]])
@@ -68,7 +68,7 @@ def states_of(result: Simulation) -> np.ndarray:
 
 
 def error(time: np.ndarray, truth: np.ndarray, **options) -> float:
-    result = simulate(MODEL, recorded(time), options=SimulationSettings(**options))
+    result = simulate(MODEL, recorded(time), settings=SimulationSettings(**options))
     assert result.status is Status.COMPLETED
     np.testing.assert_array_equal(result.trajectory.time, time)
     return float(np.abs(states_of(result) - truth).max())
@@ -163,7 +163,7 @@ def test_a_stiff_model_needs_the_stiff_method():
         explicit = simulate(model, run)
     assert explicit.status in (Status.LEFT_REGION, Status.NOT_FINITE)
     assert explicit.ended < 1
-    implicit = simulate(model, run, options=SimulationSettings(method="kvaerno5"))
+    implicit = simulate(model, run, settings=SimulationSettings(method="kvaerno5"))
     assert implicit.status is Status.COMPLETED
     exact = np.array([expm(STIFF_A * t) @ [1.0, -1.0] for t in run.time])
     np.testing.assert_allclose(states_of(implicit), exact, rtol=0, atol=1e-4)
@@ -184,7 +184,7 @@ def test_a_solver_that_gives_up_is_told(monkeypatch):
     monkeypatch.setattr(integrate, "_MAX_STEPS", 500)
     model = linear_model(STIFF_A, np.array([[0.0], [1.0]]), names=["hard", "soft"])
     with pytest.warns(DfsmWarning, match="the adaptive solver gave up"):
-        result = simulate(model, stiff_run(model), options=SimulationSettings(method="tsit5"))
+        result = simulate(model, stiff_run(model), settings=SimulationSettings(method="tsit5"))
     assert result.status is Status.SOLVER_FAILED
     assert np.isfinite(result.trajectory.values).all()
     assert 0.1 < result.ended < 1.5
@@ -303,7 +303,7 @@ def test_azimuth_turns_with_the_speed(unit, factor, method):
     time = np.linspace(10, 40, 301)
     values = np.stack([np.full(301, 7.5), np.full(301, 0.0), np.full(301, 33.0)], axis=1)
     run = Trajectory(time, values, (Channel("speed", unit), Channel("u0"), Channel("psi", "deg")))
-    result = simulate(model, run, options=SimulationSettings(method=method))
+    result = simulate(model, run, settings=SimulationSettings(method=method))
     psi = np.deg2rad(33.0) + 7.5 * factor * (time - 10)
     np.testing.assert_allclose(result.trajectory["y0"], np.cos(3 * psi), rtol=0, atol=1e-9)
 
@@ -351,7 +351,7 @@ def test_more_steps_than_memory_holds_are_refused(monkeypatch):
     run = recorded(np.sort(np.append(EVEN, [0.03, 0.05])))  # the longest of 62 intervals is 0.2 s
     monkeypatch.setattr(integrate, "_MOST_STEPS", 1000)
     with pytest.raises(DfsmError, match=r"of 0\.0001 s over 12 s make 1.24e\+05 steps") as caught:
-        simulate(MODEL, run, options=SimulationSettings(step=1e-4))
+        simulate(MODEL, run, settings=SimulationSettings(step=1e-4))
     allowed = float(re.search(r"at least (\S+) s", str(caught.value))[1])
     assert integrate.mesh_of(run, allowed, "linear").steps <= 1000
     with pytest.raises(DfsmError, match="a shorter time window"):

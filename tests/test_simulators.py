@@ -28,7 +28,7 @@ from dfsm import (
     two_link_robot_with_gravity,
 )
 from dfsm.simulators.two_link_robot import holding_torques
-from dfsm.waveforms import held
+from dfsm.simulators.waveforms import held
 
 TIME = np.linspace(0, 1, 201)
 KNOTS = RandomKnots(low=-1.0, high=1.0, spacing=0.25)

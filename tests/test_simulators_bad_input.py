@@ -8,16 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dfsm import (
-    Channel,
-    DfsmError,
-    ODESystem,
-    RandomKnots,
-    Trajectory,
-    Uniform,
-    excite,
-    mass_chain,
-)
+from dfsm import Channel, DfsmError, ODESystem, RandomKnots, Trajectory, Uniform, excite, mass_chain
 
 TIME = np.linspace(0, 1, 201)
 KNOTS = RandomKnots(low=-1.0, high=1.0, spacing=0.25)

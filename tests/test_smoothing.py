@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import BSpline, CubicSpline
 
-from dfsm.derivatives import cubic_spline, smoothing_spline
+from dfsm.data.derivatives import cubic_spline, smoothing_spline
 from dfsm.errors import DfsmError
-from dfsm.smoothing import _Mesh
+from dfsm.numerics.smoothing import _Mesh
 from motion import TIME, error, motion, quantised
 
 # -- cubic spline ---------------------------------------------------------------------------------

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from dfsm.correction import destabilised
-from dfsm.corrective import GaussianUnits
+from dfsm.core.types import Array
 from dfsm.errors import DfsmError
-from dfsm.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
-from dfsm.stability import fastest_growth, stabilise, state_matrix
-from dfsm.types import Array
+from dfsm.fitting.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.stabilize import stabilise, state_matrix
+from dfsm.models.corrective import GaussianUnits
+from dfsm.models.stability import destabilised, fastest_growth
 from systems import OSCILLATOR_A, linear_model
 
 # Inputs [u, w, x1, x2, v1, v2]; x' = v is known, v' is fitted.
@@ -80,7 +80,7 @@ def test_the_change_is_the_cheapest_one() -> None:
     best = minimize(cost, start, method="SLSQP", constraints=constraint)
     least = cost(np.asarray(plain.model.coefficients[0])[:, COLUMNS].ravel())
     assert cost(start) > least
-    # An independent constrained optimiser, started there, finds nothing much cheaper.
+    # An independent constrained optimizer, started there, finds nothing much cheaper.
     assert cost(start) - least <= 1.05 * (best.fun - least)
 
 

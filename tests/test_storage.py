@@ -19,19 +19,23 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-import dfsm.bundle
-import dfsm.storage
 from conftest import files_of
-from dfsm.config import load_config
-from dfsm.corrective import GP, MLP, RBF, NoCorrection
+from dfsm.config.fit import load_config
+from dfsm.core import bundle
+from dfsm.core.version import __version__
+from dfsm.data.readers import read
 from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.fit import fit
-from dfsm.linear import LPV
-from dfsm.read import read
-from dfsm.samples import FitSettings
-from dfsm.signals import Azimuth
-from dfsm.simulate import simulate
-from dfsm.storage import load, load_all, save
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF
+from dfsm.fitting.fit import fit
+from dfsm.fitting.linear import LPV
+from dfsm.fitting.settings import FitSettings
+from dfsm.models import model_folder
+from dfsm.models.model_folder import load, load_all, save
+from dfsm.models.signals import Azimuth
+from dfsm.simulation.simulate import simulate
 
 KINDS = {
     "rbf": RBF(samples=12),
@@ -44,8 +48,8 @@ KINDS = {
 PREDICT = """
 import sys, json
 import numpy as np
-from dfsm.read import read
-from dfsm.simulate import simulate
+from dfsm.data.readers import read
+from dfsm.simulation.simulate import simulate
 
 def predictions(models, run):
     found = {}
@@ -63,7 +67,7 @@ def predictions(models, run):
     return found
 """
 NEW_PROCESS = """
-from dfsm.storage import load_all
+from dfsm.models.model_folder import load_all
 run = read(sys.argv[1])
 print(json.dumps({p: predictions(load_all(p), run) for p in sys.argv[2:]}))
 """
@@ -142,8 +146,8 @@ def test_the_manifest_is_readable_and_complete(models, runs, choices):
     text = (models["rbf"][1] / "manifest.json").read_text(encoding="utf-8")
     assert text.count("\n") > 50
     manifest = json.loads(text)
-    assert manifest["format"] == dfsm.storage.FORMAT
-    assert manifest["dfsm"] == dfsm.__version__
+    assert manifest["format"] == model_folder.FORMAT
+    assert manifest["dfsm"] == __version__
     signals = manifest["signals"]
     assert [(c["name"], c["unit"]) for c in signals["states"]] == [("q", "m"), ("q_dot", "m/s")]
     assert [(c["name"], c["unit"]) for c in signals["outputs"]] == [("y", "kN"), ("z", "m")]
@@ -193,7 +197,7 @@ def test_a_failed_save_keeps_the_old_model(models, tmp_path, monkeypatch, place,
 
         monkeypatch.setattr(Path, "rename", once)
     else:
-        monkeypatch.setattr(dfsm.bundle, place, fail)
+        monkeypatch.setattr(bundle, place, fail)
     with pytest.raises(DfsmError if failure else KeyboardInterrupt) as caught:
         save(models["rbf"][0].model, path)
     if failure:
@@ -293,7 +297,7 @@ def test_a_manifest_whose_checksum_holds_but_whose_content_does_not(model):
     manifest = json.loads(file.read_text(encoding="utf-8"))
     for key, value in (("models", []), ("signals", {}), ("models", {"multi-fidelity": {}})):
         forged = manifest | {key: value}
-        forged["checksum"] = dfsm.bundle._checksum(forged)
+        forged["checksum"] = bundle._checksum(forged)
         file.write_text(json.dumps(forged), encoding="utf-8")
         assert "lacks or garbles" in complaint(model)
 
@@ -318,9 +322,9 @@ def test_a_garbled_manifest_is_told(model, content, match):
 def test_a_newer_format_is_told_with_the_remedy(model):
     file = model / "manifest.json"
     manifest = json.loads(file.read_text(encoding="utf-8"))
-    file.write_text(json.dumps(manifest | {"format": dfsm.storage.FORMAT + 1, "new": []}))
+    file.write_text(json.dumps(manifest | {"format": model_folder.FORMAT + 1, "new": []}))
     said = complaint(model)
-    assert f"has format {dfsm.storage.FORMAT + 1}, this dfsm {dfsm.__version__} reads up to" in said
+    assert f"has format {model_folder.FORMAT + 1}, this dfsm {__version__} reads up to" in said
     assert said.endswith("upgrade with pip install -U dfsm")
 
 

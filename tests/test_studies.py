@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from conftest import Dfsm, example_module
-from dfsm.corrective import RBF
-from dfsm.fit import fit
+from dfsm.demos.two_link_robot import study as two_link_robot
+from dfsm.demos.two_link_robot.article import robot_article
+from dfsm.demos.two_link_robot.assess import hushed, roll
+from dfsm.demos.two_link_robot.defaults import PEER
+from dfsm.demos.two_link_robot.multi_fidelity import LINEAR, MULTI, NONLINEAR, choices, draw
+from dfsm.demos.two_link_robot.study import RobotStudy
+from dfsm.fitting.corrective.rbf import RBF
+from dfsm.fitting.fit import fit
 from dfsm.report import publish as publishing
 from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table, cell_text
 from dfsm.report.article_page import write_article
-from dfsm.report.robot import robot_article
 from dfsm.simulators import two_link_robot as arm
-from dfsm.studies import two_link_robot
-from dfsm.studies.assess import hushed, roll
-from dfsm.studies.defaults import PEER
-from dfsm.studies.multi_fidelity import LINEAR, MULTI, NONLINEAR, choices, draw
-from dfsm.studies.two_link_robot import RobotStudy
 
 PAGE = Path(__file__).parents[1] / "docs" / "two-link-robot.md"
 

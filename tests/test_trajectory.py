@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dfsm.data.dataset import Dataset
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, near_matches
-from dfsm.trajectory import Channel, Dataset, Trajectory
 
 A, B, C = Channel("PtfmPitch", "deg", 0.01), Channel("GenSpeed", "rpm"), Channel("GenTq", "kN-m")
 
@@ -350,7 +351,7 @@ def test_windows_and_stacks_of_unequal_runs():
 
 
 def test_bundled_data_in_another_order_is_the_same_dataset():
-    from dfsm.read import read_all
+    from dfsm.data.readers import read_all
 
     folder = Path(__file__).parents[1] / "examples" / "iea15"
     names = ["iea15_2dof_06mps_s01.parquet", "iea15_2dof_06mps_s09.outb"]

@@ -11,16 +11,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from benchmarks.accuracy import demo
 
+from benchmarks.accuracy import demo
 from dfsm.control import load_solution, save_solution
-from dfsm.corrective import NoCorrection
 from dfsm.errors import DfsmError, DfsmWarning
-from dfsm.fit import fit
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
 from dfsm.report import write_solution_report
 from dfsm.report.publish import publish
-from dfsm.report.turbine_control import CLAIMS, control_article, trends
-from dfsm.studies.turbine_control import (
+from systems import linear_model
+from turbine_article import CLAIMS, control_article, trends
+from turbine_control import (
     BEST_COEFFICIENT,
     BLADE,
     MOMENT,
@@ -29,18 +30,17 @@ from dfsm.studies.turbine_control import (
     SPEED,
     TORQUE,
     ControlStudy,
-    ControlStudySize,
+    ControlStudySettings,
     Region,
     mean_power,
-    optimise,
+    optimize,
     problem,
     steady_gains,
     study,
     turbine_case,
 )
-from systems import linear_model
 
-SIZE = ControlStudySize(points=200, pitch_limits=(5.0, 7.0))
+SIZE = ControlStudySettings(points=200, pitch_limits=(5.0, 7.0))
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_staying_inside_keeps_near_the_data_at_a_cost(region: Region, found: Con
 
 
 def test_an_optimum_that_keeps_a_tighter_limit_is_not_sought_again(region: Region):
-    size = ControlStudySize(points=60, pitch_limits=(30.0, 20.0, 5.0), inside=False)
+    size = ControlStudySettings(points=60, pitch_limits=(30.0, 20.0, 5.0), inside=False)
     results = study([region], size).results
     assert [r.most_pitch for r in results] == [30.0, 20.0, 5.0] * 2
     loose, tighter, tight = results[3:]
@@ -198,7 +198,7 @@ def test_bounds_that_cannot_be_met_are_named(region: Region):
     # A platform that must stay level in 12 m/s of wind, at rated torque and no blade pitch.
     bounds = {**case.bounds, TORQUE: (19000.0, 19900.0), BLADE: (0.0, 1.0), SPEED: (1.9, 6.9)}
     hard = replace(case, bounds=bounds)
-    r = optimise(region, region.tests[0], hard, 2.0, replace(SIZE, points=60))
+    r = optimize(region, region.tests[0], hard, 2.0, replace(SIZE, points=60))
     assert not r.solution.solved
     assert "dynamics of" in r.solution.message or "misses by" in r.solution.message
     article = control_article(ControlStudy((r,), SIZE, 1.0, {}))

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from conftest import Dfsm
+from dfsm.data.readers import read
+from dfsm.data.readers.tables import write_table
+from dfsm.data.readers.turbsim import disk_wind, read_turbsim, with_field_wind
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.read import disk_wind, read, read_turbsim, with_field_wind, write_table
-from dfsm.trajectory import Channel, Trajectory
 
 RADIUS, HUB, DY, NY, NZ, COUNT, DT = 50.0, 90.0, 10.0, 13, 14, 40, 0.5
 REAL = Path(__file__).parents[1] / "examples" / "iea15" / "iea15_2dof_12mps_s08"

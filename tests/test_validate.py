@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import periodogram
 
-from dfsm.corrective import NoCorrection
-from dfsm.derivatives import StateSpec, differentiate
+from dfsm.data.derivatives import StateSpec, differentiate
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.fatigue import damage_equivalent_load
-from dfsm.fit import fit
-from dfsm.samples import FitSettings
-from dfsm.simulate import Status, simulate
-from dfsm.spectra import Band, spectrum
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.validate import compared, validate
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
+from dfsm.fitting.settings import FitSettings
+from dfsm.numerics.fatigue import damage_equivalent_load
+from dfsm.numerics.spectra import Band, spectrum
+from dfsm.simulation.simulate import Status, simulate
+from dfsm.validation.validate import compared, validate
 from systems import OSCILLATOR, OSCILLATOR_A, OSCILLATOR_B, driving_run, linear_model
 
 EXPONENTS = (3.0, 4.0, 5.0, 10.0)

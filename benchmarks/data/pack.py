@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dfsm.read import read_openfast, write_table
-from dfsm.read.turbsim import read_turbsim
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.types import Array
+from dfsm.core.types import Array
+from dfsm.data.readers.openfast import read_openfast
+from dfsm.data.readers.tables import write_table
+from dfsm.data.readers.turbsim import read_turbsim
+from dfsm.data.trajectory import Channel, Trajectory
 
 HERE = Path(__file__).parent
 FIELD = "iea15_2dof_12mps_s08"

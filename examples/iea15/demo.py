@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 
 import dfsm
-from dfsm.console import print_validations
+from dfsm.cli.tables import print_validations
+from dfsm.core.files import write_json
+from dfsm.core.progress import track
+from dfsm.core.workers import processors, work_through
+from dfsm.data.readers import with_wall_times
 from dfsm.errors import hushed
-from dfsm.files import write_json
-from dfsm.progress import track
-from dfsm.read import with_wall_times
-from dfsm.workers import processors, work_through
 
 DATA = Path(__file__).parent
 FOR_CONTROL = "6 m/s, for control"

@@ -15,16 +15,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import demo  # its neighbour
-
 import dfsm
-from dfsm.console import print_article
+from dfsm.cli.tables import print_article
+from dfsm.core.workers import processors
 from dfsm.errors import hushed
 from dfsm.report.publish import publish
-from dfsm.report.turbine_control import control_article
-from dfsm.studies.turbine_control import ControlStudy, Region, study
-from dfsm.workers import processors
+from turbine_article import control_article
+from turbine_control import ControlStudy, Region, study
 
-# Winds (m/s, as in the file names) and the seeds to optimise for: two in the transition region,
+# Winds (m/s, as in the file names) and the seeds to optimize for: two in the transition region,
 # one below and one above it.
 SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
 
@@ -42,7 +41,7 @@ def regions(models: Path) -> list[Region]:
 
 
 def main(arguments: Sequence[str] | None = None) -> ControlStudy:
-    """Optimise, print the tables, write the page and the figures."""
+    """Optimize, print the tables, write the page and the figures."""
     parser = argparse.ArgumentParser(description="Optimal control on bundled OpenFAST runs.")
     parser.add_argument("--models", type=Path, default=Path("out"), help="folder of demo.py")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from dfsm.read import read_openfast, read_table, write_table
-from dfsm.trajectory import Trajectory
+from dfsm.data.readers.openfast import read_openfast
+from dfsm.data.readers.tables import read_table, write_table
+from dfsm.data.trajectory import Trajectory
 
 HERE = Path(__file__).parent
 UNMODIFIED = ("iea15_2dof_06mps_s09", "iea15_2dof_12mps_s09", "iea15_2dof_18mps_s09")

@@ -6,19 +6,13 @@ The public names; each is imported when it is first used, so that ``import dfsm`
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from dfsm.core.version import __version__
 
 if TYPE_CHECKING:
-    from dfsm.calibrate import calibrate
-    from dfsm.compare import RankedCandidate, Ranking, compare
-    from dfsm.config import load_config
+    from dfsm.config.fit import load_config
     from dfsm.control import (
-        AdaptiveResult,
-        AdaptiveSettings,
         DirectTranscription,
         MultipleShooting,
         OptimalControlProblem,
@@ -27,110 +21,115 @@ if TYPE_CHECKING:
         Solution,
         check_run,
         load_solution,
-        optimise_adaptively,
         save_solution,
         solve,
     )
-    from dfsm.corrective import GP, MLP, RBF, IncrementalRBF, NoCorrection
-    from dfsm.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
+    from dfsm.core.progress import show_progress
+    from dfsm.data.dataset import Dataset
+    from dfsm.data.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
+    from dfsm.data.features import Feature
+    from dfsm.data.info import describe
+    from dfsm.data.readers import read, read_all
+    from dfsm.data.readers.tables import write_table
+    from dfsm.data.readers.turbsim import read_turbsim, with_field_wind
+    from dfsm.data.trajectory import Channel, Trajectory
     from dfsm.errors import DfsmError, DfsmWarning
-    from dfsm.excitation import Chirp, Multisine, RandomKnots, RandomSteps, Uniform, excite
-    from dfsm.export import RoscoInput, write_rosco
-    from dfsm.features import Feature
-    from dfsm.fit import FitResult, fit
-    from dfsm.intervals import Intervals, load_intervals
-    from dfsm.linear import LPV, LTI
-    from dfsm.model import DFSM
-    from dfsm.progress import show_progress
-    from dfsm.read import (
-        describe,
-        read,
-        read_all,
-        read_turbsim,
-        with_field_wind,
-        write_table,
-    )
-    from dfsm.refine import RefineResult, RefineSettings, refine
+    from dfsm.exports.rosco import RoscoInput, write_rosco
+    from dfsm.fitting.corrective import NoCorrection
+    from dfsm.fitting.corrective.gaussian_process import GP
+    from dfsm.fitting.corrective.perceptron import MLP
+    from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
+    from dfsm.fitting.fit import FitResult, fit
+    from dfsm.fitting.linear import LPV, LTI
+    from dfsm.fitting.settings import FitSettings
+    from dfsm.loops.adaptive import AdaptiveResult, AdaptiveSettings, optimize_adaptively
+    from dfsm.models.dfsm import DFSM
+    from dfsm.models.model_folder import load, load_all, save
+    from dfsm.models.signals import Azimuth
+    from dfsm.models.steady import SteadyState, steady_state
+    from dfsm.refinement.refine import RefineResult, RefineSettings, refine
     from dfsm.report import write_report, write_solution_report
-    from dfsm.samples import FitSettings
-    from dfsm.signals import Azimuth
-    from dfsm.simulate import Simulation, SimulationSettings, Status, simulate
-    from dfsm.simulators import (
-        ODESystem,
-        mass_chain,
-        two_link_robot,
-        two_link_robot_with_gravity,
+    from dfsm.selection.compare import RankedCandidate, Ranking, compare
+    from dfsm.selection.trial import Candidate, Outcome
+    from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
+    from dfsm.simulators import ODESystem, mass_chain, two_link_robot, two_link_robot_with_gravity
+    from dfsm.simulators.excitation import (
+        Chirp,
+        Multisine,
+        RandomKnots,
+        RandomSteps,
+        Uniform,
+        excite,
     )
-    from dfsm.steady import SteadyState, steady_state
-    from dfsm.storage import load, load_all, save
-    from dfsm.trajectory import Channel, Dataset, Trajectory
-    from dfsm.trial import Candidate, Outcome
-    from dfsm.validate import Validation, compared, validate
+    from dfsm.validation.calibrate import calibrate
+    from dfsm.validation.intervals import Intervals, load_intervals
+    from dfsm.validation.results import Validation
+    from dfsm.validation.validate import compared, validate
 
 # Where each public name lives, in the order of the data flow.
 _HOME = {
     "DfsmError": "errors",
     "DfsmWarning": "errors",
-    "show_progress": "progress",
-    "Channel": "trajectory",
-    "Trajectory": "trajectory",
-    "Dataset": "trajectory",
-    "read": "read",
-    "read_all": "read",
-    "write_table": "read",
-    "describe": "read",
-    "read_turbsim": "read",
-    "with_field_wind": "read",
-    "RandomKnots": "excitation",
-    "RandomSteps": "excitation",
-    "Multisine": "excitation",
-    "Chirp": "excitation",
-    "Uniform": "excitation",
-    "excite": "excitation",
+    "show_progress": "core.progress",
+    "Channel": "data.trajectory",
+    "Trajectory": "data.trajectory",
+    "Dataset": "data.dataset",
+    "read": "data.readers",
+    "read_all": "data.readers",
+    "write_table": "data.readers.tables",
+    "describe": "data.info",
+    "read_turbsim": "data.readers.turbsim",
+    "with_field_wind": "data.readers.turbsim",
+    "RandomKnots": "simulators.excitation",
+    "RandomSteps": "simulators.excitation",
+    "Multisine": "simulators.excitation",
+    "Chirp": "simulators.excitation",
+    "Uniform": "simulators.excitation",
+    "excite": "simulators.excitation",
     "ODESystem": "simulators",
     "two_link_robot": "simulators",
     "two_link_robot_with_gravity": "simulators",
     "mass_chain": "simulators",
-    "StateSpec": "derivatives",
-    "Filter": "derivatives",
-    "DerivativeSettings": "derivatives",
-    "differentiate": "derivatives",
-    "Feature": "features",
-    "LTI": "linear",
-    "LPV": "linear",
-    "RBF": "corrective",
-    "IncrementalRBF": "corrective",
-    "GP": "corrective",
-    "MLP": "corrective",
-    "NoCorrection": "corrective",
-    "Azimuth": "signals",
-    "DFSM": "model",
-    "SteadyState": "steady",
-    "steady_state": "steady",
-    "FitSettings": "samples",
-    "FitResult": "fit",
-    "fit": "fit",
-    "RefineSettings": "refine",
-    "RefineResult": "refine",
-    "refine": "refine",
-    "save": "storage",
-    "load": "storage",
-    "load_all": "storage",
-    "Status": "simulate",
-    "Simulation": "simulate",
-    "SimulationSettings": "simulate",
-    "simulate": "simulate",
-    "Validation": "validate",
-    "compared": "validate",
-    "validate": "validate",
-    "Candidate": "trial",
-    "Outcome": "trial",
-    "RankedCandidate": "compare",
-    "Ranking": "compare",
-    "compare": "compare",
-    "calibrate": "calibrate",
-    "Intervals": "intervals",
-    "load_intervals": "intervals",
+    "StateSpec": "data.derivatives",
+    "Filter": "data.derivatives",
+    "DerivativeSettings": "data.derivatives",
+    "differentiate": "data.derivatives",
+    "Feature": "data.features",
+    "LTI": "fitting.linear",
+    "LPV": "fitting.linear",
+    "RBF": "fitting.corrective.rbf",
+    "IncrementalRBF": "fitting.corrective.rbf",
+    "GP": "fitting.corrective.gaussian_process",
+    "MLP": "fitting.corrective.perceptron",
+    "NoCorrection": "fitting.corrective",
+    "Azimuth": "models.signals",
+    "DFSM": "models.dfsm",
+    "SteadyState": "models.steady",
+    "steady_state": "models.steady",
+    "FitSettings": "fitting.settings",
+    "FitResult": "fitting.fit",
+    "fit": "fitting.fit",
+    "RefineSettings": "refinement.refine",
+    "RefineResult": "refinement.refine",
+    "refine": "refinement.refine",
+    "save": "models.model_folder",
+    "load": "models.model_folder",
+    "load_all": "models.model_folder",
+    "Status": "simulation.simulate",
+    "Simulation": "simulation.simulate",
+    "SimulationSettings": "simulation.simulate",
+    "simulate": "simulation.simulate",
+    "Validation": "validation.results",
+    "compared": "validation.validate",
+    "validate": "validation.validate",
+    "Candidate": "selection.trial",
+    "Outcome": "selection.trial",
+    "RankedCandidate": "selection.compare",
+    "Ranking": "selection.compare",
+    "compare": "selection.compare",
+    "calibrate": "validation.calibrate",
+    "Intervals": "validation.intervals",
+    "load_intervals": "validation.intervals",
     "OptimalControlProblem": "control",
     "DirectTranscription": "control",
     "MultipleShooting": "control",
@@ -139,41 +138,33 @@ _HOME = {
     "Solution": "control",
     "save_solution": "control",
     "load_solution": "control",
-    "AdaptiveSettings": "control",
-    "AdaptiveResult": "control",
-    "optimise_adaptively": "control",
+    "AdaptiveSettings": "loops.adaptive",
+    "AdaptiveResult": "loops.adaptive",
+    "optimize_adaptively": "loops.adaptive",
     "RunCheck": "control",
     "check_run": "control",
-    "RoscoInput": "export",
-    "write_rosco": "export",
+    "RoscoInput": "exports.rosco",
+    "write_rosco": "exports.rosco",
     "write_report": "report",
     "write_solution_report": "report",
-    "load_config": "config",
+    "load_config": "config.fit",
 }
 
 __all__ = [*_HOME, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]  # noqa: PLE0604
 
 
-class _Package(ModuleType):
-    """A package with lazy names; a function wins over the submodule that bears its name.
-
-    The import system sets ``dfsm.fit`` to the submodule as soon as anything imports it, which
-    would hide the function `fit`; such assignments are dropped.
-    """
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in _HOME:
-            raise AttributeError(f"module 'dfsm' has no attribute '{name}'")
-        value = getattr(importlib.import_module(f"dfsm.{_HOME[name]}"), name)
-        self.__dict__[name] = value
-        return value
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _HOME and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-    def __dir__(self) -> list[str]:
-        return sorted(__all__)
+# Public names of an earlier version, for programs written for it.
+_EARLIER = {"optimise_adaptively": "optimize_adaptively"}
 
 
-sys.modules[__name__].__class__ = _Package
+def __getattr__(name: str) -> Any:
+    name = _EARLIER.get(name, name)
+    if name not in _HOME:
+        raise AttributeError(f"module 'dfsm' has no attribute '{name}'")
+    value = getattr(importlib.import_module(f"dfsm.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.comparison import ChannelError
 from dfsm.control.solution import RATE, Solution
+from dfsm.core.files import json_value
+from dfsm.core.settings import require
+from dfsm.core.types import Array
+from dfsm.core.units import POWERS, SPEEDS, TORQUES, plain
+from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError, missing, printable
-from dfsm.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
-from dfsm.files import json_value
-from dfsm.settings import require
-from dfsm.trajectory import Role, Trajectory
-from dfsm.types import Array
-from dfsm.units import POWERS, SPEEDS, TORQUES, plain
+from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.validation.results import ChannelError
 
 # Limits count as kept within this part of their size.
 _SLACK = 1e-6

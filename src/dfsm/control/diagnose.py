@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dfsm.control.nlp import violation
-from dfsm.control.program import Program
+from dfsm.control.nlp.program import Program
+from dfsm.control.nlp.watch import violation
+from dfsm.core.types import Array
 from dfsm.errors import DfsmError
-from dfsm.types import Array
 
 # A variable within this share of its size from a bound counts as being at it.
 _AT_BOUND = 1e-5

@@ -8,9 +8,9 @@ import numpy as np
 
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Solution
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.trajectory import Trajectory
-from dfsm.types import Array
 
 
 @dataclass(frozen=True, eq=False)

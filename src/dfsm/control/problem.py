@@ -16,15 +16,15 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from dfsm.control.signals import GROUPS, Plant, plant_of
+from dfsm.control.names import GROUPS, Plant, plant_of
+from dfsm.core.settings import require
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
-from dfsm.latents import latent_state, latents_at, poles
-from dfsm.model import DFSM
-from dfsm.settings import require
-from dfsm.signals import with_computed
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import latent_state, latents_at, poles
+from dfsm.models.signals import with_computed
 from dfsm.simulators import ODESystem
-from dfsm.trajectory import Trajectory
-from dfsm.types import Array
 
 # A number, None for no limit, a function of time (array in, array out), or a run with the channel.
 Level = float | None | Callable[[Array], Any] | Trajectory
@@ -66,7 +66,7 @@ class OptimalControlProblem:
     boundary
         ``name: (function, low, high)``, constraints on both ends.
     parameters
-        ``name: value`` fixes a plant parameter, ``name: (low, high)`` leaves it to the optimiser.
+        ``name: value`` fixes a plant parameter, ``name: (low, high)`` leaves it to the optimizer.
     disturbances
         Known over the whole horizon, linear between samples. Several runs are several scenarios:
         each has its own states and controls, all share the free parameters and the final time.
@@ -139,7 +139,7 @@ class OptimalControlProblem:
 
     @property
     def free_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that are left to the optimiser, in the model's order."""
+        """Names of the parameters that are left to the optimizer, in the model's order."""
         names = self.plant.names("parameters")
         return tuple(n for n in names if not is_number(self.parameters[n]))
 
@@ -299,7 +299,7 @@ def _check_names(problem: OptimalControlProblem) -> None:
         if parameter not in problem.parameters:
             raise DfsmError(
                 f"{name}: parameter '{parameter}' has no value: give parameters={{'{parameter}': "
-                "value}, or a pair (low, high) to optimise it"
+                "value}, or a pair (low, high) to optimize it"
             )
     for place in ("constraints", "boundary"):
         for key, given in getattr(problem, place).items():

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.control.functions import common_of, functions_of
-from dfsm.control.grid import Grid
 from dfsm.control.guess import Start
+from dfsm.control.mesh.grid import Grid
+from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Replay
-from dfsm.trajectory import Trajectory
-from dfsm.types import Array
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
 
 TOLERANCE = 1e-9
 _MOST_STEPS = 100_000

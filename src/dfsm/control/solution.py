@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.control.grid import Grid
+from dfsm.control.mesh.grid import Grid
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import printable
-from dfsm.trajectory import Trajectory
-from dfsm.types import Array
 
 # Before the name of a control in `Solution.bounds`: bounds of its rate.
 RATE = "rate of "
@@ -98,7 +98,7 @@ class Solution:
         Of path and boundary constraints by name, shape ``(scenario × time,)``, in the
         objective's unit per unit of the constraint.
     parameters
-        All plant parameters, optimised or not.
+        All plant parameters, optimized or not.
     grid
         The mesh and its scheme.
     error

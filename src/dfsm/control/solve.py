@@ -12,17 +12,17 @@ import numpy as np
 
 from dfsm.control.diagnose import conflict, require_finite, worst_violation
 from dfsm.control.guess import Start, start_of
-from dfsm.control.nlp import NlpOptions, Outcome, solve_nlp
+from dfsm.control.names import Signals
+from dfsm.control.nlp.ipopt import Outcome, SolverSettings, solve_nlp
+from dfsm.control.nlp.program import Program
+from dfsm.control.nlp.shooting import MultipleShooting, Shooting, SingleShooting
+from dfsm.control.nlp.transcription import DirectTranscription, Transcription, node_data
 from dfsm.control.problem import OptimalControlProblem, level
-from dfsm.control.program import Program
 from dfsm.control.replay import replay
-from dfsm.control.shooting import MultipleShooting, Shooting, SingleShooting
-from dfsm.control.signals import Signals
 from dfsm.control.solution import RATE, Ending, Solution
-from dfsm.control.transcription import DirectTranscription, Transcription, node_data
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.trajectory import Role, Trajectory
-from dfsm.types import Array
 
 Shot = Transcription | Shooting
 Method = DirectTranscription | MultipleShooting | SingleShooting
@@ -164,8 +164,8 @@ def _solve_meshes(
         _prepare(shot, z)
         warm = near and _is_near(shot, start)
         record.compile += clock.perf_counter() - begin
-        options = NlpOptions(method.tolerance, method.most_iterations, warm)
-        outcome = _solve_scaled(shot.program, z, options, multipliers if warm else None)
+        settings = SolverSettings(method.tolerance, method.most_iterations, warm)
+        outcome = _solve_scaled(shot.program, z, settings, multipliers if warm else None)
         start = shot.unscaled(outcome.z)
         errors = shot.errors(start)
         record.add(shot, outcome, start, float(errors.max()))
@@ -202,20 +202,20 @@ def _prepare(shot: Shot, z: Array) -> None:
 
 
 def _solve_scaled(
-    program: Program, z: Array, options: NlpOptions, multipliers: Array | None
+    program: Program, z: Array, settings: SolverSettings, multipliers: Array | None
 ) -> Outcome:
     """Solve, and again if the objective turns out to be so small that tolerances hide it."""
     scale = program.objective_scale
-    first = _solve_once(program, z, options, multipliers)
-    if options.warm and first.ending not in (*_GOOD, "interrupted"):
+    first = _solve_once(program, z, settings, multipliers)
+    if settings.warm and first.ending not in (*_GOOD, "interrupted"):
         # What looked close was not: start afresh from the same point.
-        first = _solve_once(program, z, replace(options, warm=False), None)
+        first = _solve_once(program, z, replace(settings, warm=False), None)
     value = abs(program.cost(first.z))
     wanted = min(1 / max(value, 1e-300), _MOST_SCALE)
     if first.ending not in _GOOD or value == 0 or wanted < _CLEARLY * scale:
         return first
     program.objective_scale = wanted
-    second = _solve_once(program, first.z, replace(options, warm=True), first.multipliers)
+    second = _solve_once(program, first.z, replace(settings, warm=True), first.multipliers)
     if second.ending != "solved":
         program.objective_scale = scale
         return replace(first, ending="interrupted") if second.ending == "interrupted" else first
@@ -227,13 +227,13 @@ def _solve_scaled(
 
 
 def _solve_once(
-    program: Program, z: Array, options: NlpOptions, multipliers: Array | None
+    program: Program, z: Array, settings: SolverSettings, multipliers: Array | None
 ) -> Outcome:
     """Solve; multipliers, given and found, are those of the objective without its scale."""
     scale = program.objective_scale
     if multipliers is not None:
         multipliers = None if len(multipliers) != program.m else scale * multipliers
-    found = solve_nlp(program, z, options, multipliers)
+    found = solve_nlp(program, z, settings, multipliers)
     return replace(
         found,
         multipliers=found.multipliers / scale,

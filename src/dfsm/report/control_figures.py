@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dfsm.control.solution import Solution
+from dfsm.core.types import Array
 from dfsm.report.article import Curve, Figure, Panel
-from dfsm.types import Array
 
 _TIME = "time (s)"
 # Bounds further away than this share of a signal's range would flatten it: they are not drawn.

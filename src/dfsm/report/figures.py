@@ -12,18 +12,12 @@ from typing import Any
 import numpy as np
 from scipy.signal import resample_poly
 
-from dfsm.simulate import Simulation, Status
-from dfsm.spectra import Band, Spectrum
-from dfsm.trajectory import Trajectory
-from dfsm.types import Array
-from dfsm.validate import (
-    LOW,
-    ChannelStatistics,
-    ModelRun,
-    RunComparison,
-    Validation,
-    frequency_bands,
-)
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+from dfsm.numerics.spectra import Band, Spectrum
+from dfsm.simulation.simulate import Simulation, Status
+from dfsm.validation.results import ChannelStatistics, ModelRun, RunComparison, Validation
+from dfsm.validation.validate import LOW, frequency_bands
 
 # Seconds between the samples drawn: fine enough for blade passing (about 0.5 Hz) and a file of a
 # few megabytes. Longer runs are thinned further.

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dfsm.core.files import write_file
 from dfsm.errors import DfsmError
-from dfsm.files import write_file
 from dfsm.report.article import Article, Curve, Figure, Panel
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from dfsm.files import check_file, write_json
+from dfsm.core.files import check_file, write_json
 from dfsm.report.article import Article
 from dfsm.report.article_page import write_article
 from dfsm.report.print_figures import write_figures

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dfsm.report.elements import Markup, element, join, number, percent, table
 from dfsm.report.figures import bands_of
-from dfsm.simulate import Status
-from dfsm.validate import ChannelStatistics, RunComparison, Validation
+from dfsm.simulation.simulate import Status
+from dfsm.validation.results import ChannelStatistics, RunComparison, Validation
 
 
 def peaks(name: str, validation: Validation, run: RunComparison) -> Markup:

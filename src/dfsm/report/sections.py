@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.data.trajectory import Channel
 from dfsm.report.elements import MISSING, Cell, Markup, element, join, number, plural, table
-from dfsm.simulate import Status
-from dfsm.trajectory import Channel
-from dfsm.validate import Validation
+from dfsm.simulation.simulate import Status
+from dfsm.validation.results import Validation
 
 # More sentences than this about rollouts that ended early are folded away.
 _MOST_NOTES = 5

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import dfsm.jax_setup  # noqa: F401
-from dfsm.types import Array
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.types import Array
 
 Function = Callable[..., Any]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from dfsm.settings import require
+from dfsm.core.settings import require
+from dfsm.data.trajectory import Channel
 from dfsm.simulators.ode import ODESystem
-from dfsm.trajectory import Channel
 
 _STIFFNESS = 1.0  # N/m
 _HARDENING = 0.5  # N/m³

@@ -17,10 +17,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dfsm.core.progress import track
+from dfsm.core.settings import require
+from dfsm.core.types import Array, ComplexArray
+from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.excitation import Excitation, Uniform
-from dfsm.progress import track
-from dfsm.settings import require
 from dfsm.simulators.evaluate import (
     Function,
     jacobian_jax,
@@ -31,11 +32,10 @@ from dfsm.simulators.evaluate import (
     shape_numpy,
     takes_four,
 )
-from dfsm.simulators.solve import Start, solve_jax, solve_numpy
+from dfsm.simulators.excitation import Excitation, Uniform
+from dfsm.simulators.ode_solver import Start, solve_jax, solve_numpy
 from dfsm.simulators.start import as_mesh, as_signal, as_vector, draw_signal, draw_vector
-from dfsm.trajectory import Channel, Role, Trajectory
-from dfsm.types import Array, ComplexArray
-from dfsm.waveforms import Signal
+from dfsm.simulators.waveforms import Signal
 
 _ROLES: dict[str, Role] = {
     "states": "state",

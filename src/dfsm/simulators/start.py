@@ -8,11 +8,11 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.excitation import Excitation, Uniform, excite
-from dfsm.trajectory import Channel, Trajectory
-from dfsm.types import Array
-from dfsm.waveforms import Signal, held, interpolated
+from dfsm.simulators.excitation import Excitation, Uniform, excite
+from dfsm.simulators.waveforms import Signal, held, interpolated
 
 
 def as_mesh(time: ArrayLike) -> Array:
@@ -121,15 +121,15 @@ def _from_samples(what: str, given: ArrayLike, channels: Sequence[Channel], time
 
 def draw_vector(
     what: str,
-    choice: Uniform | ArrayLike,
+    excitation: Uniform | ArrayLike,
     channels: Sequence[Channel],
     k: int,
     seed: Sequence[int],
 ) -> Array:
     """Values of run `k`: drawn, or the next of the given rows, shape ``(channel,)``."""
-    if isinstance(choice, Uniform):
-        return choice.draw(len(channels), seed)
-    rows = _numbers(what, choice)
+    if isinstance(excitation, Uniform):
+        return excitation.draw(len(channels), seed)
+    rows = _numbers(what, excitation)
     if len(channels) == 1 and rows.ndim == 1:
         rows = rows[:, None]
     return as_vector(what, rows[k % len(rows)] if rows.ndim == 2 and len(rows) else rows, channels)
@@ -137,7 +137,7 @@ def draw_vector(
 
 def draw_signal(
     what: str,
-    choice: Excitation | None,
+    excitation: Excitation | None,
     channels: Sequence[Channel],
     duration: float,
     seed: Sequence[int],
@@ -149,16 +149,16 @@ def draw_signal(
     DfsmError
         Channels without a choice, or a choice without channels.
     """
-    if choice is None and channels:
+    if excitation is None and channels:
         names = ", ".join(c.name for c in channels)
         raise DfsmError(
             f"no signal for the {what} {names}: say what kind to draw, e.g. RandomKnots"
         )
-    if choice is None:
+    if excitation is None:
         return held([0.0], np.empty((1, 0)), duration)
     if not channels:
         raise DfsmError(f"the system has no {what} to excite: leave them out")
-    return excite(choice, len(channels), duration, seed)
+    return excite(excitation, len(channels), duration, seed)
 
 
 def _told(channels: Sequence[Channel]) -> str:

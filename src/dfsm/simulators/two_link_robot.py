@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Channel
 from dfsm.simulators.ode import ODESystem
-from dfsm.trajectory import Channel
-from dfsm.types import Array
 
 # Moments of inertia in kg m², gravity in m/s², lengths in m, masses in kg.
 _J1, _J2, _GRAVITY, _L1, _L2, _M1, _M2 = 0.12, 0.15, 9.81, 0.6, 0.8, 3.0, 2.5

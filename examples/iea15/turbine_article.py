@@ -1,0 +1,264 @@
+"""The optimal control study of the floating turbine, told: results, trends, a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+from dfsm.report.article import Article, Figure, Section, Table, cell_text, listed
+from dfsm.report.control_figures import stacked_figure
+from turbine_control import (
+    BEST_COEFFICIENT,
+    BLADE,
+    MOMENT,
+    PITCH,
+    SHEAR,
+    SPEED,
+    TORQUE,
+    WIND,
+    ControlStudy,
+    Result,
+    mean_power,
+    wind_power,
+)
+
+KEY = "turbine_control"
+# Relative differences below this count as none.
+_SAME = 3e-4
+# m/s around 11 that count as near.
+_NEAR = 1.0
+_POWER = "power (MW)"
+_FIGURE = (WIND, TORQUE, BLADE, PITCH, SPEED, _POWER, SHEAR, MOMENT)
+_HEADS = (
+    "case",
+    "Θp,max (deg)",
+    "power (MW)",
+    "max Θp (deg)",
+    "ω (rpm)",
+    "mean ω",
+    "mean β (deg)",
+    "dβ/dt (deg/s)",
+    "outside (%)",
+    "ended",
+    "steps",
+    "time (s)",
+    "replay (deg)",
+)
+CLAIMS = (
+    "Θp peaks near w = 11 m/s",
+    "lower Θp,max: β more active",
+    "ω lower",
+    "power lower",
+    "power ≤ available",
+)
+
+
+def control_article(study: ControlStudy) -> Article:
+    """Put the findings of the study into sections, tables and figures.
+
+    Parameters
+    ----------
+    study
+        From `turbine_control.study`.
+    """
+    groups: dict[str, list[Result]] = {}
+    for r in study.results:
+        groups.setdefault(r.series, []).append(r)
+    return Article(
+        key=KEY,
+        title="Optimal control of a floating 15 MW turbine",
+        lede=(
+            "Torque and blade pitch that maximise the power of a surrogate, with the wind known "
+            "over the horizon and a limit Θp,max on the platform pitch: the study of Sundarrajan "
+            "and Herber (IMECE 2023, Sec. 4) on other runs of the same turbine. Case a has the "
+            "paper's bounds and a model fitted as in the paper; case b has the bounds of the "
+            "turbine that was simulated and a model refined on rollouts that knows some mechanics."
+        ),
+        sections=(
+            trends_section(study),
+            *[_series_section(name, found) for name, found in groups.items()],
+        ),
+    )
+
+
+# -- trends -------------------------------------------------------------------------------------
+
+
+def trends_section(study: ControlStudy) -> Section:
+    """What the paper leads one to expect, checked series by series."""
+    rows = [
+        (f"{_short(name)}, {variant}", *trends(found).values())
+        for (name, variant), found in study.series().items()
+    ]
+    table = Table(
+        "control_trends",
+        "Trends over Θp,max in every wind series and case",
+        ("wind series, case", *CLAIMS),
+        tuple(rows),
+        note=(
+            "Θp peaks: mean wind while Θp is among its highest 5 %, with the highest Θp,max; near "
+            "is within 1 m/s. β: its mean; its rate stands in the tables below. No change: "
+            "the optimum does not depend on Θp,max. Power: electrical. Available: mean of c ρ/2 π "
+            "R² w³ with the mean wind w over the disk and the best known power coefficient c, "
+            f"{BEST_COEFFICIENT} in steady wind or what a training run of the region took, if that "
+            "is more: the disk's mean leaves out the turbulence within the disk."
+        ),
+    )
+    gains = Table(
+        "control_gains",
+        "How the rotor speed of each model settles when a control rises for good, at the mean wind "
+        "of the region",
+        (
+            "region, model",
+            "torque (rpm per MN m)",
+            "blade pitch (rpm per deg)",
+            "signs of a turbine",
+        ),
+        tuple((name, *gain, _word(max(gain) <= 0)) for name, gain in study.gains.items()),
+        note=(
+            "Neither is positive for a turbine, and at its best power coefficient blade pitch does "
+            "nothing. Where one is, the model has learnt the controller, which raises both when "
+            "the rotor is fast; an optimizer makes use of that."
+        ),
+        digits=2,
+    )
+    return Section("trends", "Do the trends hold?", tables=(table, gains))
+
+
+def trends(found: Mapping[float, Result]) -> dict[str, str]:
+    """Say of every claim whether it holds, and what was found.
+
+    Parameters
+    ----------
+    found
+        Results of one wind series and variant by Θ_p,max.
+    """
+    solved = [found[limit] for limit in sorted(found) if found[limit].solution.solved]
+    if not solved:
+        return dict.fromkeys(CLAIMS, "not solved")
+    top = solved[-1]
+    near = abs(top.peak_wind - 11) <= _NEAR
+    told = (
+        f"{_word(near)}: {top.peak_wind:.1f} m/s",
+        _rising([-r.blade_mean for r in solved]),
+        _rising([r.mean_speed for r in solved]),
+        _rising([r.power for r in solved]),
+        _powers(solved),
+    )
+    return dict(zip(CLAIMS, told, strict=True))
+
+
+def _powers(solved: Sequence[Result]) -> str:
+    """The highest power and what the wind holds."""
+    most, available = max(r.power for r in solved), solved[0].available
+    return f"{_word(most <= available)}: {most:.2f} of {available:.2f} MW"
+
+
+def _rising(values: Sequence[float]) -> str:
+    """Whether values never fall and rise overall; equal ones are told apart."""
+    size = _SAME * max(map(abs, values))
+    if max(values) - min(values) <= size:
+        return "no change"
+    return _word(all(after >= before - size for before, after in pairwise(values)))
+
+
+def _word(holds: bool) -> str:
+    return "yes" if holds else "no"
+
+
+# -- one wind series ----------------------------------------------------------------------------
+
+
+def _series_section(name: str, found: Sequence[Result]) -> Section:
+    first = found[0]
+    own = next(r.case for r in found if r.case.key == "b")
+    loads = listed([f"|{n}| ≤ {own.bounds[n][1]:.0f}" for n in (SHEAR, MOMENT)])
+    table = Table(
+        f"control_{_short(name)}",
+        f"Optimal controls for the wind of {name}",
+        _HEADS,
+        tuple(_cells(r) for r in found),
+        note=(
+            "Power: mean of η τ ω. dβ/dt: RMS. Outside: share of the horizon with an input beyond "
+            "its training range, or a combination that did not occur there. Steps: of the solver; "
+            "time: with compilation. Replay: "
+            "how far Θp is off at most when an adaptive integrator applies the controls with all "
+            "samples of the wind. "
+            "Where an optimum keeps a tighter Θp,max by itself, it stands there, too. "
+            f"Recorded in closed loop: {cell_text(mean_power(first.recorded))} MW of mechanical "
+            f"power; available to a rotor at its best: {cell_text(first.available)} MW, a power "
+            f"coefficient of {cell_text(first.available / wind_power(first.recorded))}. "
+            f"Case b: {loads} (kN, kN m)."
+        ),
+        digits=4,
+    )
+    return Section(
+        _short(name),
+        f"{first.region}: {name}",
+        paragraphs=tuple(_diagnoses(found)),
+        tables=(table,),
+        figures=tuple(
+            _figure(name, [r for r in found if r.variant == variant])
+            for variant in dict.fromkeys(r.variant for r in found)
+            if variant != "a" or first.region == "12 m/s"
+        ),
+    )
+
+
+def _short(name: str) -> str:
+    return name.replace("iea15_2dof_", "")
+
+
+def _cells(r: Result) -> tuple[str | float | None, ...]:
+    run, solution = r.run, r.solution
+    speed = run[SPEED]
+    return (
+        r.variant,
+        f"{r.most_pitch:g}",
+        r.power if solution.solved else None,
+        float(run[PITCH].max()),
+        f"{speed.min():.2f} to {speed.max():.2f}",
+        r.mean_speed,
+        r.blade_mean,
+        r.blade_activity,
+        100 * (solution.outside or 0.0),
+        solution.ending.name.lower().replace("_", " "),
+        solution.iterations,
+        sum(solution.seconds.values()),
+        r.replay,
+    )
+
+
+def _diagnoses(found: Sequence[Result]) -> list[str]:
+    """Where a problem has no solution, or leaves the training range."""
+    told = []
+    for variant in dict.fromkeys(r.variant for r in found):
+        results = [r for r in found if r.variant == variant]
+        for r in results:
+            if not r.solution.solved:
+                told.append(f"Case {variant}, Θp,max = {r.most_pitch:g} deg: {r.solution.message}.")
+        shares: dict[str, list[float]] = {}
+        for r in results:
+            for name, share in r.outside.items():
+                shares.setdefault(name, []).append(100 * share)
+        left = [
+            f"{name} at {max(values):.0f} % of the nodes"
+            for name, values in sorted(shares.items(), key=lambda item: -max(item[1]))
+            if max(values) >= 1
+        ]
+        if left:
+            told.append(f"Case {variant} leaves the training range in {listed(left)} (the most).")
+    return told
+
+
+def _figure(name: str, found: Sequence[Result]) -> Figure:
+    variant = found[0].variant
+    key = f"control_{_short(name)}_{variant.replace(', ', '_')}"
+    return stacked_figure(
+        key,
+        f"Case {variant}, wind of {name}: wind, controls, states, power and tower-base loads for "
+        "every Θp,max. Dashed: bounds; those of the platform pitch in the colour of their case.",
+        {f"Θp,max = {r.most_pitch:g} deg": r.solution for r in found},
+        _FIGURE,
+        {_POWER: {f"Θp,max = {r.most_pitch:g} deg": r.power_course for r in found}},
+    )

@@ -1,0 +1,495 @@
+"""The paper's optimal control study of a floating 15 MW turbine (Sec. 4), on given models and runs.
+
+    minimise ∫ ( −η τ ω + w₁ τ² + w₂ β² ) dt     τ in MN m, ω in rpm, β in deg
+
+over torque and blade pitch, with the wind known over the horizon, for several limits of the
+platform pitch, and with two sets of bounds: the paper's, on a model of the wind region alone, and
+those of the turbine that was simulated, on one model for all winds.
+`examples/iea15/optimal_control.py` runs it on the bundled data.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+
+from dfsm.control import DirectTranscription, OptimalControlProblem, Solution, solve
+from dfsm.core.progress import track
+from dfsm.core.settings import require, settings_class
+from dfsm.core.types import Array
+from dfsm.core.workers import work_through
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+from dfsm.models.dfsm import DFSM
+
+# Channels of the turbine, in OpenFAST's words and units: kN m, deg, deg, rpm, m/s, kN, kN m.
+TORQUE, BLADE, PITCH, SPEED, WIND = "GenTq", "BldPitch1", "PtfmPitch", "GenSpeed", "RotWind"
+SHEAR, MOMENT = "TwrBsFxt", "TwrBsMyt"
+# Rotor radius in m, air density in kg/m³ and best power coefficient in steady wind of the IEA 15 MW
+# turbine (Gaertner et al. 2020).
+RADIUS, DENSITY, BEST_COEFFICIENT = 120.0, 1.225, 0.489
+MEGAWATT = np.pi / 30e3  # of kN m × rpm
+_TORQUE_WEIGHT, _BLADE_WEIGHT = 1e-5, 0.5
+_PERCENTILE = 99.9  # of the loads in the training runs, in case (b)
+# Share of the horizon outside the training data above which case (b) is solved inside, too.
+_LEAVES = 0.01
+# What counts as "at the peak" of the platform pitch: this share of the horizon.
+_PEAK = 0.05
+
+Limits = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Bounds and generator efficiency.
+
+    Attributes
+    ----------
+    key, title
+        Short name, and what it is.
+    efficiency
+        η, of mechanical into electrical power.
+    lowest_pitch
+        Lower bound of the platform pitch in deg; the upper one is varied.
+    bounds
+        Of all other channels, in their units.
+    """
+
+    key: str
+    title: str
+    efficiency: float
+    lowest_pitch: float
+    bounds: Limits
+
+    @property
+    def cost(self) -> Callable[..., Any]:
+        """Integrand; the same function for the same efficiency, so that it is compiled once."""
+        return _cost(self.efficiency)
+
+
+@cache
+def _cost(efficiency: float) -> Callable[..., Any]:
+    def cost(s: Any) -> Any:
+        torque = s.u[TORQUE] / 1e3
+        power = efficiency * torque * s.x[SPEED]
+        return -power + _TORQUE_WEIGHT * torque**2 + _BLADE_WEIGHT * s.u[BLADE] ** 2
+
+    return cost
+
+
+CONTROL_BOUNDS: Limits = {TORQUE: (1670.0, 19900.0), BLADE: (0.0, 22.6)}
+PAPER = Case(
+    "a",
+    "the paper's bounds",
+    0.99,
+    0.0,
+    {**CONTROL_BOUNDS, SPEED: (1.9, 7.2), SHEAR: (0.0, 5e3), MOMENT: (0.0, 4e5)},
+)
+
+
+@settings_class
+class ControlStudySettings:
+    """How much to compute; the defaults are the paper's.
+
+    Attributes
+    ----------
+    points
+        Equidistant nodes.
+    pitch_limits
+        Upper bounds of the platform pitch in deg.
+    duration
+        Of the horizon in s.
+    tolerance
+        Of the nonlinear program.
+    inside
+        Where solutions of case (b) leave the training data, solve it also with states and controls
+        kept inside.
+    """
+
+    points: int = 1000
+    pitch_limits: tuple[float, ...] = (5.0, 6.0, 7.0)
+    duration: float = 600.0
+    tolerance: float = 1e-7
+    inside: bool = True
+
+    def __post_init__(self) -> None:
+        require(self.points >= 3, "points", self.points, "at least 3")
+        require(len(self.pitch_limits) > 0, "pitch_limits", self.pitch_limits, "one or more")
+        require(self.duration > 0, "duration", self.duration, "more than 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A range of wind speeds with its models and its runs.
+
+    Attributes
+    ----------
+    name
+        For tables, e.g. ``"12 m/s"``.
+    wind
+        Mean wind in m/s.
+    own
+        Model fitted to `training`, for case (a).
+    model
+        Model for case (b), which may know more winds.
+    training, tests
+        Runs; the winds of the latter are what controls are optimized for.
+    start
+        Where the horizons begin, in s; the start-up transients before it do not count.
+    """
+
+    name: str
+    wind: float
+    own: DFSM
+    model: DFSM
+    training: Sequence[Trajectory]
+    tests: Sequence[Trajectory]
+    start: float
+
+    @cached_property
+    def best_coefficient(self) -> float:
+        """The best power coefficient that is known of this turbine, of the disk's mean wind.
+
+        In steady wind, or of a training run, which takes more where there is turbulence within the
+        disk.
+        """
+        runs = [run.window(self.start) for run in self.training]
+        return max([BEST_COEFFICIENT, *(mean_power(r) / wind_power(r) for r in runs)])
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One problem, solved or not.
+
+    Attributes
+    ----------
+    region, series
+        Names of the region and of the run whose wind it is.
+    case, most_pitch, inside
+        What bounds held: which case, Θ_p,max in deg, and whether the training range too.
+    solution
+        See `Solution`.
+    recorded
+        The run in closed loop, over the same horizon.
+    available
+        Mean aerodynamic power in MW of the disk's mean wind at the best power coefficient known.
+    outside
+        Share of the nodes outside the training range, by input that leaves it.
+    """
+
+    region: str
+    series: str
+    case: Case
+    most_pitch: float
+    inside: bool
+    solution: Solution
+    recorded: Trajectory
+    available: float
+    outside: Mapping[str, float]
+
+    @property
+    def variant(self) -> str:
+        """E.g. ``"b, inside"``."""
+        return self.case.key + (", inside" if self.inside else "")
+
+    @property
+    def run(self) -> Trajectory:
+        """Optimal states, controls, disturbances and outputs."""
+        return self.solution.trajectory
+
+    @property
+    def power(self) -> float:
+        """Mean electrical power in MW."""
+        return self.case.efficiency * mean_power(self.run)
+
+    @property
+    def power_course(self) -> Array:
+        """Electrical power in MW at the nodes."""
+        return self.case.efficiency * self.run[TORQUE] * self.run[SPEED] * MEGAWATT
+
+    @property
+    def blade_activity(self) -> float:
+        """RMS rate of the blade pitch in deg/s."""
+        rate = np.diff(self.run[BLADE]) / np.diff(self.run.time)
+        return float(np.sqrt(np.mean(rate**2)))
+
+    @property
+    def blade_mean(self) -> float:
+        """Mean blade pitch in deg."""
+        return mean(self.run, self.run[BLADE])
+
+    @property
+    def mean_speed(self) -> float:
+        """In rpm."""
+        return mean(self.run, self.run[SPEED])
+
+    @property
+    def peak_wind(self) -> float:
+        """Mean wind in m/s while the platform pitch is among its highest 5 %."""
+        pitch = self.run[PITCH]
+        return float(self.run[WIND][pitch >= np.quantile(pitch, 1 - _PEAK)].mean())
+
+    @property
+    def replay(self) -> float:
+        """Largest deviation of the platform pitch in deg when the controls are simulated."""
+        replays = self.solution.replays
+        return replays[0].deviation[PITCH] if replays else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class ControlStudy:
+    """What the study found.
+
+    Attributes
+    ----------
+    results
+        In the order solved.
+    size
+        How much was computed.
+    seconds
+        Wall time.
+    gains
+        By model and wind, see `steady_gains`.
+    """
+
+    results: tuple[Result, ...]
+    size: ControlStudySettings
+    seconds: float
+    gains: Mapping[str, tuple[float, float]]
+
+    def series(self) -> dict[tuple[str, str], dict[float, Result]]:
+        """Results that differ in Θ_p,max only, by wind series and variant."""
+        found: dict[tuple[str, str], dict[float, Result]] = {}
+        for r in self.results:
+            found.setdefault((r.series, r.variant), {})[r.most_pitch] = r
+        return found
+
+
+def turbine_case(region: Region) -> Case:
+    """Bounds for the turbine that was simulated: rated speed, and loads as in its own runs."""
+    runs = [run.window(region.start) for run in region.training]
+    loads = {
+        name: float(np.percentile(np.abs(np.concatenate([r[name] for r in runs])), _PERCENTILE))
+        for name in (SHEAR, MOMENT)
+    }
+    bounds = {**CONTROL_BOUNDS, SPEED: (1.9, 7.56)} | {n: (-v, v) for n, v in loads.items()}
+    return Case("b", "bounds of this turbine", 0.9576, -1.0, bounds)
+
+
+def mean(run: Trajectory, values: Array) -> float:
+    """Mean over time of values at a run's samples, by the trapezoidal rule."""
+    return float(np.trapezoid(values, run.time) / run.duration)
+
+
+def mean_power(run: Trajectory) -> float:
+    """Mean mechanical power in MW: torque times speed in rad/s."""
+    return mean(run, run[TORQUE] * run[SPEED]) * MEGAWATT
+
+
+def wind_power(run: Trajectory) -> float:
+    """Mean power in MW of the disk's mean wind: of ρ/2 π R² w³."""
+    return DENSITY / 2 * np.pi * RADIUS**2 * mean(run, run[WIND] ** 3) / 1e6
+
+
+def problem(
+    model: DFSM,
+    wind: Trajectory,
+    case: Case,
+    most_pitch: float,
+    horizon: tuple[float, float],
+) -> OptimalControlProblem:
+    """The paper's problem for one wind series.
+
+    Parameters
+    ----------
+    model
+        With the channels of this study.
+    wind
+        Run with the disturbances; what it holds before the horizon gives latent states.
+    case
+        Bounds and efficiency.
+    most_pitch
+        Θ_p,max in deg.
+    horizon
+        First and last time in s.
+
+    Raises
+    ------
+    DfsmError
+        The model lacks one of the study's channels, or the run is too short.
+    """
+    known = {
+        c.name: c for g in ("states", "controls", "outputs") for c in getattr(model.signals, g)
+    }
+    for name in (TORQUE, BLADE, PITCH, SPEED, SHEAR, MOMENT):
+        if name not in known:
+            raise DfsmError(
+                f"the model has no channel '{name}', which the turbine's problem needs: fit one "
+                f"with states {PITCH} and {SPEED}, controls {TORQUE} and {BLADE}, and outputs "
+                f"{SHEAR} and {MOMENT}"
+            )
+    return OptimalControlProblem(
+        model=model,
+        horizon=horizon,
+        cost=case.cost,
+        bounds={**case.bounds, PITCH: (case.lowest_pitch, most_pitch)},
+        disturbances=wind,
+        name=f"{wind.name}, case {case.key}, pitch up to {most_pitch:g} deg",
+    )
+
+
+def optimize(
+    region: Region,
+    wind: Trajectory,
+    case: Case,
+    most_pitch: float,
+    size: ControlStudySettings,
+    near: Result | None = None,
+) -> Result:
+    """Solve the problem for one wind series and one limit of the platform pitch.
+
+    Parameters
+    ----------
+    region
+        Gives the models.
+    wind
+        One of the region's test runs.
+    case, most_pitch
+        Bounds.
+    size
+        Nodes, horizon and tolerance.
+    near
+        Stay inside the training data, and start from this result.
+    """
+    inside = near is not None
+    guess = near.solution if near is not None and near.solution.solved else None
+    method = DirectTranscription(
+        scheme="trapezoidal",
+        mesh=size.points - 1,
+        refine=None,
+        tolerance=size.tolerance,
+        stay_inside=inside,
+    )
+    model = region.own if case is PAPER else region.model
+    horizon = (region.start, region.start + size.duration)
+    solution = solve(problem(model, wind, case, most_pitch, horizon), method, guess)
+    run, names = solution.trajectory, [c.name for c in model.signals.inputs]
+    beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
+    outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
+    recorded = wind.window(run.time[0], run.time[-1])
+    return Result(
+        region=region.name,
+        series=wind.name,
+        case=case,
+        most_pitch=most_pitch,
+        inside=inside,
+        solution=solution,
+        recorded=recorded,
+        available=region.best_coefficient * wind_power(recorded),
+        outside=outside,
+    )
+
+
+def study(
+    regions: Sequence[Region], size: ControlStudySettings | None = None, jobs: int = 1
+) -> ControlStudy:
+    """Solve both cases for every wind series and every limit of the platform pitch.
+
+    Parameters
+    ----------
+    regions
+        Models and runs.
+    size
+        How much to compute; None is the paper's size.
+    jobs
+        Wind series at a time, each in a process of its own.
+    """
+    size = size or ControlStudySettings()
+    begin = clock.perf_counter()
+    tasks = [(k, s) for k, region in enumerate(regions) for s in range(len(region.tests))]
+    found = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
+    results = [result for task in tasks for result in found[task]]
+    gains = {}
+    for region in regions:
+        models = {"a": region.own, "b": region.model}
+        for key, model in models.items():
+            gains[f"{region.name}, case {key}"] = steady_gains(model, region.wind)
+    return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
+
+
+def _series(
+    shared: tuple[Sequence[Region], ControlStudySettings], task: tuple[int, int]
+) -> list[Result]:
+    """All problems of one wind series, given by the numbers of its region and of its run there."""
+    regions, size = shared
+    region = regions[task[0]]
+    wind, own = region.tests[task[1]], turbine_case(region)
+    paper, free = (_limits(region, wind, case, size) for case in (PAPER, own))
+    results = [*paper, *free]
+    if size.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
+        results += _limits(region, wind, own, size, free)
+    return results
+
+
+def _limits(
+    region: Region,
+    wind: Trajectory,
+    case: Case,
+    size: ControlStudySettings,
+    near: Sequence[Result] = (),
+) -> list[Result]:
+    """Results for all limits of the platform pitch, as they stand in `size`.
+
+    Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too. Inside the
+    training data each is solved from its counterpart in `near`.
+    """
+    starts = {r.most_pitch: r for r in near}
+    found: dict[float, Result] = {}
+    last = None
+    for limit in sorted(size.pitch_limits, reverse=True):
+        if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
+            last = _tighter(last, limit)
+        else:
+            last = optimize(region, wind, case, limit, size, starts.get(limit))
+        found[limit] = last
+    return [found[limit] for limit in size.pitch_limits]
+
+
+def _tighter(found: Result, limit: float) -> Result:
+    """The same result as that of a limit which it keeps."""
+    solution = found.solution
+    low, high = solution.bounds[PITCH]
+    bounds = {**solution.bounds, PITCH: np.stack([low, np.minimum(high, limit)])}
+    return replace(found, most_pitch=limit, solution=replace(solution, bounds=bounds))
+
+
+def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:
+    """How the rotor speed of a model settles when torque or blade pitch rise for good.
+
+    Both gains are negative for a turbine: either brakes the rotor. Closed-loop data can teach a
+    model the reverse, because the controller raises both when the rotor is fast.
+
+    Parameters
+    ----------
+    model
+        Linearized at its operating point.
+    wind
+        In m/s, where that is.
+
+    Returns
+    -------
+    tuple of float
+        In rpm per MN m and in rpm per deg.
+    """
+    s, grid = model.signals, np.asarray(model.region.grid)
+    point = np.array([np.interp(wind, grid, v) for v in np.asarray(model.region.operating).T])
+    A, B, _, _ = model.jacobians(*model.split(point))
+    gain = -np.linalg.solve(A, B)
+    row = gain[[c.name for c in s.states].index(SPEED)]
+    names = [c.name for c in s.controls]
+    return float(row[names.index(TORQUE)] * 1e3), float(row[names.index(BLADE)])

@@ -1,0 +1,425 @@
+"""The command line: one verb per thing a user wants; every mistake is one sentence.
+
+Exit codes: 0 done · 1 done, but a simulation ended early or a problem was not solved · 2 bad
+input · 3 a bug in dfsm · 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dfsm.cli.control import check_run, export_rosco
+from dfsm.cli.intervals import calibrate
+from dfsm.cli.optimize import optimize
+from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
+from dfsm.core.progress import show_progress
+from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
+
+if TYPE_CHECKING:
+    from dfsm.simulation.simulate import Simulation
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Derivative function surrogate models from time-domain simulations.",
+)
+demos = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Studies that bring their own simulations."
+)
+app.add_typer(demos, name="demo")
+app.command()(optimize)
+app.command("export-rosco")(export_rosco)
+app.command("check-run")(check_run)
+app.command()(calibrate)
+
+IntervalFile = Annotated[
+    Path | None, typer.Option("--intervals", help="Prediction intervals made by dfsm calibrate.")
+]
+
+
+@app.command()
+def info(files: Files, as_json: AsJson = False) -> None:
+    """List channels, units, ranges, sampling and quantisation, and what looks wrong."""
+    from dfsm.cli.tables import print_info
+    from dfsm.data.info import describe
+    from dfsm.data.readers import read_all
+
+    with show_progress():
+        found = [describe(run) for run in read_all(files)]
+    if as_json:
+        print_json([f.to_dict() for f in found])
+    else:
+        print_info(found)
+
+
+@app.command()
+def init(
+    files: Files,
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")] = Path(
+        "config.yaml"
+    ),
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a commented configuration with the channels found in the files."""
+    from dfsm.config.template import write_config
+    from dfsm.core.files import check_file
+
+    check_file(output)
+    if output.exists() and not force:
+        raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
+    with working(quiet):
+        write_config(files, output)
+    say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
+
+
+@app.command()
+def fit(
+    config: Annotated[Path, typer.Argument(help="Configuration made by dfsm init.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Model folder to write.")],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit a multi-fidelity model and save it as a folder."""
+    from dfsm.config.fit import load_config
+    from dfsm.fitting.fit import fit as run_fit
+    from dfsm.models.model_folder import check_target, save
+
+    check_target(output)
+    with working(quiet):
+        settings, runs = load_config(config)
+        result = run_fit(runs, settings.fit_settings(), settings.refine)
+        model = result.model
+    replaced = output.exists() and any(output.iterdir())
+    save(model, output, result.nonlinear)
+    if replaced and not quiet:
+        print(printable(f"note: replaced the model that was in {output}"), file=sys.stderr)
+    if as_json:
+        from dfsm.core.files import json_value
+
+        print_json(json_value(dict(model.provenance.record)))
+        return
+    say(lines(model.summary()), quiet)
+    seconds = sum(result.seconds.values())
+    say(
+        f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",
+        quiet,
+    )
+
+
+@app.command()
+def compare(
+    config: Annotated[Path, typer.Argument(help="Configuration with a key 'compare'.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for models and results.")],
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Fits at a time; default half the processors.")
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit several structures and rank them on runs held out; goes on where it was ended."""
+    from dfsm.cli.tables import print_ranking
+    from dfsm.config.fit import parse_candidates
+    from dfsm.data.readers import read_all
+    from dfsm.selection.compare import check_output
+    from dfsm.selection.compare import compare as run_compare
+
+    settings, candidates = parse_candidates(config)
+    check_output(output, candidates)
+    files, hold_out = settings.compare.validation, settings.compare.hold_out
+    with working(quiet):
+        runs = read_all(settings.data.train, config.parent)
+        validation = None if files is None else read_all(files, config.parent)
+        found = run_compare(
+            candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
+        )
+    if found.best is None:
+        raise DfsmError("; ".join(found.failures()))
+    if as_json:
+        print_json(found.to_dict())
+    elif not quiet:
+        print_ranking(found)
+    if found.best.score is None:
+        raise typer.Exit(1)
+
+
+@app.command()
+def summary(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+) -> None:
+    """Describe a saved model: signals, decisions, eigenvalues, warnings."""
+    from dfsm.models.model_folder import load
+
+    typer.echo(lines(load(model).summary()))
+
+
+@app.command()
+def validate(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    files: Files,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="HTML report to write.")
+    ] = None,
+    metrics: Annotated[
+        Path | None, typer.Option("--json", help="JSON file with all figures to write.")
+    ] = None,
+    wall_times: Annotated[
+        Path | None,
+        typer.Option(help="JSON file: run name to seconds the simulator took, for speed-ups."),
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option(help="Start of the test window in s; default as in the fit.")
+    ] = None,
+    stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
+    intervals: IntervalFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate test runs, compare with what was recorded, write a report."""
+    from dfsm.cli.tables import print_validation
+    from dfsm.core.files import check_file, write_json
+    from dfsm.data.readers import read_all, with_wall_times
+    from dfsm.models.model_folder import NONLINEAR, load_all
+    from dfsm.report import write_report
+    from dfsm.validation.intervals import load_intervals
+    from dfsm.validation.validate import compared
+    from dfsm.validation.validate import validate as run_validate
+
+    targets = [path for path in (output, metrics) if path is not None]
+    for path in targets:
+        check_file(path)
+    models = load_all(model)
+    main = next(iter(models.values()))
+    start = fit_start(main) if start is None else start
+    given = None if intervals is None else load_intervals(intervals)
+    with working(quiet):
+        runs = read_all(files)
+        for path in targets:
+            check_file(path, [wall_times, intervals, *(r.source for r in runs)])
+        if wall_times is not None:
+            runs = with_wall_times(runs, wall_times)
+        candidates = compared(main, models.get(NONLINEAR))
+        found = run_validate(candidates, runs, start=start, stop=stop, intervals=given)
+        if output is not None:
+            write_report({model.name or str(model): found}, output)
+    if metrics is not None:
+        write_json(metrics, found.to_dict())
+    if not quiet:
+        print_validation(found)
+    for path in targets:
+        say(f"wrote {path}", quiet)
+    _exit_if_ended([r.models[m].simulation for r in found.runs for m in ("multi-fidelity",)], quiet)
+
+
+@app.command()
+def simulate(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    run: Annotated[str, typer.Argument(help="File with the inputs and the initial state.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
+    start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
+    stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
+    method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
+    step: Annotated[
+        float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
+    ] = None,
+    intervals: IntervalFile = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate the model with the inputs of one run and write states and outputs."""
+    from dfsm.core.files import check_file
+    from dfsm.data.readers import read
+    from dfsm.data.readers.tables import table_suffix, write_table
+    from dfsm.models.model_folder import load
+    from dfsm.models.signals import with_computed
+    from dfsm.simulation.simulate import METHODS, SimulationSettings
+    from dfsm.simulation.simulate import simulate as run_simulate
+    from dfsm.validation.intervals import load_intervals
+
+    if method not in METHODS:
+        raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    table_suffix(output)
+    check_file(output, [path for path in (run, intervals) if path and Path(path).exists()])
+    surrogate = load(model)
+    start = fit_start(surrogate) if start is None else start
+    given = None if intervals is None else load_intervals(intervals)
+    if given is not None:
+        given.check(surrogate)
+    with working(quiet), hushed():  # the outcome is printed below
+        signals = surrogate.signals
+        recorded = with_computed(read(run), signals.hub_height, signals.features)
+        result = run_simulate(
+            surrogate,
+            recorded,
+            start=start,
+            stop=stop,
+            settings=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
+        )
+    write_table(result.trajectory if given is None else given.beside(result, recorded), output)
+    if as_json:
+        print_json(
+            {
+                "status": result.status.name.lower(),
+                "message": result.message,
+                "ended_s": result.ended,
+                "outside": result.outside,
+                "wall_time_s": result.wall_time,
+                "output": str(output),
+            }
+        )
+    else:
+        say(f"wrote {output} ({len(result.trajectory)} samples): {result.message}", quiet)
+    _exit_if_ended([result], quiet or as_json)
+
+
+@app.command()
+def wind(
+    field: Annotated[Path, typer.Argument(help="TurbSim field (.bts) that drove the runs.")],
+    files: Files,
+    radius: Annotated[float, typer.Option(help="Rotor radius in m.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the new files.")],
+    quiet: Quiet = False,
+) -> None:
+    """Add the wind over the rotor disk and its slopes to runs: the disturbances to fit with."""
+    from dfsm.core.files import check_file
+    from dfsm.data.readers import read_all
+    from dfsm.data.readers.tables import write_table
+    from dfsm.data.readers.turbsim import read_turbsim, with_field_wind
+
+    source = read_turbsim(field)
+    with working(quiet):
+        runs = read_all(files)
+        output.mkdir(parents=True, exist_ok=True)
+        targets = [output / f"{run.name}.parquet" for run in runs]
+        for target in targets:
+            check_file(target, [run.source for run in runs])
+        added = [with_field_wind(run, source, radius) for run in runs]
+    for run, target in zip(added, targets, strict=True):
+        write_table(run, target)
+        say(f"wrote {target} with RotWind, RotShearV and RotShearH", quiet)
+
+
+@demos.command("two-link-robot")
+def two_link_robot(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the page, its tables and figures.")
+    ] = Path("out"),
+    quick: Annotated[bool, typer.Option("--quick", help="Less of everything: a minute.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the simulations and fits.")] = 0,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat the paper's study of two robot arms, and go beyond it: about four minutes."""
+    from dfsm.cli.tables import print_article
+    from dfsm.core.files import json_value
+    from dfsm.demos.two_link_robot.article import KEY, robot_article
+    from dfsm.demos.two_link_robot.study import QUICK, study
+    from dfsm.report.publish import page_of, publish
+
+    page_of(output, KEY)
+    with working(quiet):
+        article = robot_article(study(QUICK if quick else None, seed))
+    written = publish(article, output)
+    if as_json:
+        print_json(json_value(article.to_dict()))
+        return
+    if not quiet:
+        print_article(article)
+    figures = (
+        f", {len(written) - 2} files in {output / 'figures'}"
+        if len(written) > 2
+        else ("; figures for print need matplotlib: pip install 'dfsm[figures]'")
+    )
+    say(f"wrote {written[0]}, {written[1]}{figures}", quiet)
+
+
+def main() -> None:
+    """Run the command line; the only place that turns errors into exit codes."""
+    warnings.showwarning = _show_warning
+    warnings.simplefilter("always", DfsmWarning)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A terminal that lacks a letter shows an escape instead of failing.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    code = _run()
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # The reader of our output has gone (… | head), or the disk it goes to is full. Without
+        # this, the interpreter would try again on its way out and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            code = _fail(f"error: standard output could not be written ({error.strerror})", 2)
+    sys.exit(code)
+
+
+def _run() -> int:
+    try:
+        code = app(prog_name="dfsm", standalone_mode=False)
+        if code == 130:  # the command-line library has caught Ctrl-C already
+            raise KeyboardInterrupt
+        return code if isinstance(code, int) else 0
+    except DfsmError as error:
+        return _fail(f"error: {error}", 2)
+    except KeyboardInterrupt:
+        return _fail("interrupted: nothing was left half-written", 130)
+    except BrokenPipeError:
+        return 0
+    except SystemExit as stop:
+        # Libraries turn a pipe that nobody reads any more into exit code 1; nothing went wrong.
+        return 0 if isinstance(stop.__context__, BrokenPipeError) else 3
+    except OSError as error:
+        where = error.filename or "standard output"
+        return _fail(f"error: {where} cannot be used ({error.strerror or error})", 2)
+    except Exception as error:
+        return _unexpected(error)
+
+
+def _unexpected(error: Exception) -> int:
+    """Usage errors of the command-line library, and bugs."""
+    kind = type(error).__name__
+    if kind == "NoArgsIsHelpError":
+        print(str(error), file=sys.stderr)
+        return 2
+    if hasattr(error, "format_message"):
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context is not None else "dfsm"
+        text = str(error.format_message()).rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
+        return _fail(f"error: {text[:1].lower()}{text[1:]}; see {command} --help", 2)
+    if kind == "Abort":
+        return _fail("interrupted: nothing was left half-written", 130)
+    if os.environ.get("DFSM_DEBUG"):
+        raise error
+    print(f"bug in dfsm: {kind}: {error}", file=sys.stderr)
+    return _fail("please report it with the traceback that DFSM_DEBUG=1 shows", 3)
+
+
+def _fail(message: str, code: int) -> int:
+    print(printable(message), file=sys.stderr)
+    return code
+
+
+def _exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:
+    from dfsm.simulation.simulate import Status
+
+    ended = [s for s in simulations if s.status is not Status.COMPLETED]
+    if ended:
+        if not quiet:
+            print(f"{len(ended)} of {len(simulations)} simulations ended early", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
+    if issubclass(category, DfsmWarning):
+        print(printable(f"warning: {message}"), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

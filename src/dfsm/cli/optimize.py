@@ -1,0 +1,44 @@
+"""The command `dfsm optimize`: an optimal control problem from a file, solved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dfsm.cli.terminal import AsJson, Quiet, lines, print_json, say, working
+
+
+def optimize(
+    config: Annotated[Path, typer.Argument(help="YAML file: model, disturbances, cost, bounds.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find the controls that minimise a cost, for a known course of the disturbances."""
+    from dfsm.config.control import load_problem
+    from dfsm.control import solve
+    from dfsm.control.solution_folder import PAGE, check_solution_target, save_solution
+    from dfsm.report.solution_page import solution_article, write_solution_report
+
+    check_solution_target(output)
+    with working(quiet):
+        problem, method, guess = load_problem(config)
+        solution = solve(problem, method, guess)
+    save_solution(solution, output)
+    write_solution_report(solution, output / PAGE)
+    article = solution_article(solution)
+    if as_json:
+        from dfsm.core.files import json_value
+
+        told = {"ending": solution.ending.name.lower(), "message": solution.message}
+        print_json(json_value(told | {"objective": solution.objective} | article.to_dict()))
+    elif not quiet:
+        from dfsm.cli.tables import print_article
+
+        say(lines(solution.summary()), quiet)
+        print_article(article)
+        say(f"wrote {output}, with the page {PAGE}", quiet)
+    if not solution.solved:
+        raise typer.Exit(1)

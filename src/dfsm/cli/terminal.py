@@ -1,0 +1,49 @@
+"""What all commands of the terminal share: common options, progress, what is printed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dfsm.core.progress import show_progress
+from dfsm.errors import hushed, printable
+
+if TYPE_CHECKING:
+    from dfsm.models.dfsm import DFSM
+
+Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+
+
+@contextmanager
+def working(quiet: bool) -> Iterator[None]:
+    """Long work: bars on a terminal; with --quiet neither these nor warnings."""
+    with show_progress(not quiet), hushed() if quiet else nullcontext():
+        yield
+
+
+def fit_start(model: DFSM) -> float | None:
+    """Start of the fit's time window in s: where a simulation starts unless told otherwise."""
+    return model.provenance.record.get("settings", {}).get("start")
+
+
+def lines(text: str) -> str:
+    """Text that may hold names, safe to print."""
+    return "\n".join(printable(line) for line in text.split("\n"))
+
+
+def say(message: str, quiet: bool) -> None:
+    """Print one line, unless --quiet was given."""
+    if not quiet:
+        typer.echo(message)
+
+
+def print_json(value: Any) -> None:
+    """Print a value that strict JSON can hold."""
+    # ASCII, so that it is JSON in every terminal's encoding.
+    typer.echo(json.dumps(value, indent=2, allow_nan=False))

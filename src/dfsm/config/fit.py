@@ -1,0 +1,245 @@
+"""`config.yaml`: which files, which signals, which settings; checked before any work starts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from dfsm.config.parse import Strict, explain, load_yaml, parse_file
+from dfsm.core.settings import require
+from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
+from dfsm.data.features import Feature
+from dfsm.data.readers import read_all
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.signals import Azimuth
+from dfsm.refinement.refine import RefineSettings
+from dfsm.selection.compare import HOLD_OUT, check_candidates
+from dfsm.selection.trial import Candidate
+
+# Name of the configuration itself among the candidates of `compare`.
+BASE = "base"
+_CANDIDATES = "compare.candidates"
+_ADVICE = "make one with dfsm init"
+
+
+class DataConfig(Strict):
+    """Training files and the part of them that is used.
+
+    Attributes
+    ----------
+    train
+        File names or patterns, relative to the configuration file.
+    start, stop
+        Time window in s; null leaves that end open.
+    hub_height
+        In m; adds the corrected rotor wind ``RtVAvgxhCorr`` to every run.
+    """
+
+    train: list[str]
+    start: float | None = None
+    stop: float | None = None
+    hub_height: float | None = None
+
+
+class SignalConfig(Strict):
+    """Channel names by role, see `FitSettings`."""
+
+    states: list[StateSpec]
+    controls: list[str] = Field(default_factory=list)
+    disturbances: list[str] = Field(default_factory=list)
+    features: list[Feature] = Field(default_factory=list)
+    parameters: list[str] = Field(default_factory=list)
+    outputs: list[str] = Field(default_factory=list)
+
+
+class CompareConfig(Strict):
+    """What `dfsm compare` compares; `dfsm fit` does not look at it.
+
+    Attributes
+    ----------
+    candidates
+        By name the keys that each of them changes; the configuration itself is called base.
+    hold_out
+        Share of the training runs that rank the candidates.
+    validation
+        Files that rank them instead; those among the training files are not trained with.
+    """
+
+    candidates: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    hold_out: float = HOLD_OUT
+    validation: list[str] | None = None
+
+    def model_post_init(self, _: Any, /) -> None:
+        """Check what types cannot."""
+        share = "a share between 0 and 1"
+        require(0 < self.hold_out < 1, "compare.hold_out", self.hold_out, share)
+        both = self.validation is not None and "hold_out" in self.model_fields_set
+        require(not both, "compare.hold_out", self.hold_out, "no value beside compare.validation")
+        files = self.validation is None or bool(self.validation)
+        require(files, "compare.validation", "empty", "file names or patterns, or null")
+
+
+class Config(Strict):
+    """A whole `config.yaml`."""
+
+    data: DataConfig
+    signals: SignalConfig
+    derivatives: DerivativeSettings = DerivativeSettings()
+    linear: Annotated[LTI | LPV, Field(discriminator="kind")] = LTI()
+    corrective: Annotated[
+        RBF | IncrementalRBF | GP | MLP | NoCorrection, Field(discriminator="kind")
+    ] = MLP()
+    gate: float = FitSettings.gate
+    azimuth: Azimuth | None = None
+    nonlinear_only: bool = FitSettings.nonlinear_only
+    refine: RefineSettings | None = None
+    seed: int = FitSettings.seed
+    compare: CompareConfig = CompareConfig()
+
+    def fit_settings(self) -> FitSettings:
+        """The settings of `fit`."""
+        s = self.signals
+        return FitSettings(
+            states=tuple(s.states),
+            controls=tuple(s.controls),
+            disturbances=tuple(s.disturbances),
+            features=tuple(s.features),
+            parameters=tuple(s.parameters),
+            outputs=tuple(s.outputs),
+            start=self.data.start,
+            stop=self.data.stop,
+            hub_height=self.data.hub_height,
+            derivatives=self.derivatives,
+            linear=self.linear,
+            corrective=self.corrective,
+            gate=self.gate,
+            azimuth=self.azimuth,
+            nonlinear_only=self.nonlinear_only,
+            seed=self.seed,
+        )
+
+
+def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
+    """Read a configuration and the training runs that it names.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing or not YAML, a key is unknown or has a wrong type (its path is
+        given), or a pattern matches no file.
+    """
+    path = Path(path)
+    config = parse_config(path)
+    _require_files(config, path)
+    try:
+        _check_together(config)
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
+    return config, read_all(config.data.train, path.parent)
+
+
+def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:
+    """Read a configuration and the candidates that it declares, without touching the data.
+
+    Returns
+    -------
+    tuple
+        The configuration, and the candidates by name: itself first, as ``base``.
+
+    Raises
+    ------
+    DfsmError
+        As `load_config`; also without candidates, or where one has an unknown key or value.
+    """
+    path = Path(path)
+    config = parse_config(path)
+    _require_files(config, path)
+    if not config.compare.candidates:
+        raise DfsmError(
+            f"{path}: '{_CANDIDATES}' is missing: name what to try there, for instance "
+            "compare: {candidates: {gp: {corrective: {kind: gp}}}}"
+        )
+    raw = load_yaml(path, _ADVICE)
+    try:
+        _check_together(config)
+        found = {BASE: Candidate(config.fit_settings(), config.refine, f"{path.name} as it stands")}
+        for name, changes in config.compare.candidates.items():
+            found[name] = _candidate(raw, name, changes)
+        check_candidates(found)
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
+    return config, found
+
+
+def _candidate(raw: Mapping[str, Any], name: str, changes: Mapping[str, Any]) -> Candidate:
+    where = f"{_CANDIDATES}.{name}"
+    if name == BASE:
+        raise DfsmError(f"'{where}' is the configuration itself: choose another name")
+    for key in ("data", "compare"):
+        if key in changes:
+            raise DfsmError(
+                f"'{where}.{key}' cannot be changed, candidates are compared on the same runs: "
+                f"change '{key}' for all of them"
+            )
+    merged = _merged(raw, changes)
+    try:
+        config = Config.model_validate(merged)
+        _check_together(config)
+    except ValidationError as error:
+        raise DfsmError(explain(error, merged, Config, f"{where}.")) from None
+    except DfsmError as error:
+        raise DfsmError(f"{where}: {error}") from None
+    told = (f"{k} = {v}" for k, v in _changed(changes))
+    return Candidate(config.fit_settings(), config.refine, "; ".join(told))
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with some keys changed; what is of another kind has other keys and is replaced."""
+    merged = dict(base)
+    for key, value in changes.items():
+        old = base.get(key)
+        merged[key] = value
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            kind = old.get("kind")
+            if value.get("kind", kind) == kind:
+                merged[key] = _merged(old, value)
+    return merged
+
+
+def _changed(changes: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Path and value of every key that a candidate gives."""
+    found = []
+    for key, value in changes.items():
+        if isinstance(value, Mapping) and value:
+            found += _changed(value, f"{prefix}{key}.")
+        else:
+            text = value if isinstance(value, str) else None
+            shown = text or json.dumps(value, ensure_ascii=False, default=str)
+            found.append((f"{prefix}{key}", shown))
+    return found
+
+
+def _require_files(config: Config, path: Path) -> None:
+    if not config.data.train:
+        raise DfsmError(f"{path}: 'data.train' names no files: list the runs to train with")
+
+
+def _check_together(config: Config) -> None:
+    """What only shows with all keys together must not wait until the data have been read."""
+    _ = state_names(config.signals.states), config.fit_settings().roles
+
+
+def parse_config(path: Path) -> Config:
+    """Read and check a configuration without touching the data."""
+    return parse_file(path, Config, _ADVICE)

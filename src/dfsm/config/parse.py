@@ -1,0 +1,165 @@
+"""YAML files as checked settings; whatever is wrong with one is told in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from dfsm.errors import DfsmError, near_matches
+
+Parsed = TypeVar("Parsed", bound=BaseModel)
+
+
+class Strict(BaseModel):
+    """Frozen, and unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def parse_file(path: Path, kind: type[Parsed], advice: str) -> Parsed:
+    """Read a YAML file as a pydantic model; whatever is wrong with it is one sentence.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    kind
+        Model that says which keys there are.
+    advice
+        What to do without such a file.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing or not YAML, or a key is unknown, missing or wrong.
+    """
+    raw = load_yaml(path, advice)
+    try:
+        return kind.model_validate(raw)
+    except ValidationError as error:
+        raise DfsmError(f"{path}: {explain(error, raw, kind)}") from None
+    except DfsmError as error:
+        raise DfsmError(f"{path}: {error}") from None
+
+
+def load_yaml(path: Path, advice: str) -> dict[str, Any]:
+    """Mapping that a YAML file holds; `advice` says what to do without such a file."""
+    if path.is_dir():
+        inside = [*path.glob("config.yaml")] or [*path.glob("*.yaml"), *path.glob("*.yml")]
+        hint = f"did you mean {inside[0]}?" if len(inside) == 1 else f"name one, or {advice}"
+        raise DfsmError(f"{path} is a folder, a configuration file was expected: {hint}")
+    try:
+        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DfsmError(f"{path} cannot be read ({error.strerror}): {advice}") from None
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else "?"
+        raise DfsmError(f"{path}, line {line}: not valid YAML ({error.problem})") from None
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise DfsmError(f"{path} is not valid YAML ({str(error).splitlines()[0]})") from None
+    except RecursionError:
+        raise DfsmError(f"{path} is nested too deeply for a configuration") from None
+    if not isinstance(raw, dict):
+        raise DfsmError(f"{path} holds no keys; {advice}")
+    return raw
+
+
+def explain(
+    error: ValidationError, raw: dict[str, Any], kind: type[BaseModel], prefix: str = ""
+) -> str:
+    """The first thing wrong, with the path of its key as it stands in the file."""
+    first = error.errors()[0]
+    if first["type"] == "value_error":
+        # Raised by a settings class itself, already one sentence.
+        return str(first.get("ctx", {}).get("error", first["msg"]))
+    keys = _path(first["loc"], raw)
+    where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
+    where = prefix + where
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _known_keys(keys[:-1], raw, kind)
+        return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
+    if first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument"):
+        return f"key '{where}' is missing"
+    if first["type"].startswith("union_tag"):
+        kinds = ", ".join(f"'{k}'" for k in _kinds(keys, kind))
+        given = first["input"].get("kind") if isinstance(first["input"], dict) else None
+        if given is None:
+            return f"'{where}' needs a key 'kind', one of {kinds}"
+        hint = near_matches(str(given), _kinds(keys, kind))
+        return f"'{where}.kind' is '{given}', expected one of {kinds}; {hint}"
+    found = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
+    message = _MESSAGES.get(first["type"], first["msg"])
+    return f"'{where}': {message[0].lower()}{message[1:]}{found}"
+
+
+# Where pydantic speaks of Python, in the words of a configuration file.
+_KEYS, _LIST = "keys and values were expected, as {key: value}", "a list was expected, as [a, b]"
+_MESSAGES: dict[str, str] = {
+    "model_type": _KEYS,
+    "model_attributes_type": _KEYS,
+    "dataclass_type": _KEYS,
+    "dict_type": _KEYS,
+    "list_type": _LIST,
+    "tuple_type": _LIST,
+}
+
+
+def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
+    """Drop the names of union members that pydantic puts between the keys of the file."""
+    keys: list[int | str] = []
+    node: Any = raw
+    for i, key in enumerate(loc):
+        try:
+            node = node[key]
+        except (KeyError, IndexError, TypeError):
+            # The last key may be missing from the file, or be wrong; others are pydantic's own.
+            if i < len(loc) - 1:
+                continue
+        keys.append(key)
+    return keys
+
+
+def _known_keys(keys: list[int | str], raw: Any, kind: type[BaseModel]) -> list[str]:
+    """Keys that may stand at a path, from the JSON schema of the configuration."""
+    nodes = _schemas(keys, kind)
+    for key in keys:
+        raw = raw[key]
+    kinds = [n for n in nodes if _kind(n) == raw.get("kind")]
+    return list(dict.fromkeys(k for node in kinds or nodes for k in node.get("properties", {})))
+
+
+def _kinds(keys: list[int | str], kind: type[BaseModel]) -> list[str]:
+    """Values that the key 'kind' may have at a path."""
+    return [found for node in _schemas(keys, kind) if (found := _kind(node))]
+
+
+def _kind(node: dict[str, Any]) -> str | None:
+    return node.get("properties", {}).get("kind", {}).get("const")
+
+
+def _schemas(keys: list[int | str], kind: type[BaseModel]) -> list[dict[str, Any]]:
+    schema = kind.model_json_schema()
+    nodes = [schema]
+    for key in keys:
+        nodes = [child for node in nodes for child in _children(schema, node, key)]
+    return nodes
+
+
+def _children(schema: dict[str, Any], node: dict[str, Any], key: int | str) -> list[dict[str, Any]]:
+    child = node.get("items") if isinstance(key, int) else node.get("properties", {}).get(key)
+    if child is None:
+        child = node.get("additionalProperties")
+    if not isinstance(child, dict):
+        return []
+    options = child.get("oneOf") or child.get("anyOf") or [child]
+    resolved = [_resolve(schema, o) for o in options]
+    return [r for r in resolved if isinstance(r, dict)]
+
+
+def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    reference = node.get("$ref")
+    return schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node

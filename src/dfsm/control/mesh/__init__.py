@@ -1,0 +1,1 @@
+"""Collocation schemes and meshes."""

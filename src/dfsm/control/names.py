@@ -1,0 +1,172 @@
+"""Signals by name inside costs and constraints: ``s.x.GenSpeed * s.u.GenTq``.
+
+The functions of an optimal control problem see named scalars and never a column number. All of it
+can be followed by JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.data.trajectory import Channel
+from dfsm.errors import DfsmError, near_matches
+from dfsm.models.dfsm import DFSM
+from dfsm.models.region import Region
+from dfsm.numerics.hats import scheduled
+from dfsm.simulators import ODESystem
+
+# Letter of a group in user functions, and what it holds.
+GROUPS = {
+    "x": "states",
+    "u": "controls",
+    "w": "disturbances",
+    "p": "parameters",
+    "y": "outputs",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """What an optimal control problem needs of a model, whichever kind it is.
+
+    Attributes
+    ----------
+    channels
+        Channels by group, ``"states"`` to ``"outputs"``.
+    derivative, output
+        ``(x, u, w, p)`` to one vector; traceable by JAX.
+    region
+        Where the training data of a surrogate lie, on inputs [u, w, ξ, p]; None for an `ODESystem`.
+    """
+
+    channels: Mapping[str, tuple[Channel, ...]]
+    derivative: Callable[..., Any]
+    output: Callable[..., Any]
+    region: Region | None
+
+    def names(self, group: str) -> tuple[str, ...]:
+        """Names of one group, e.g. ``names("states")``."""
+        return tuple(c.name for c in self.channels[group])
+
+    def owner(self, name: str) -> str | None:
+        """Letter of the group that holds a channel, None if there is none."""
+        return next((k for k, group in GROUPS.items() if name in self.names(group)), None)
+
+
+def plant_of(model: DFSM | ODESystem) -> Plant:
+    """Make a `Plant` of a surrogate or of a system of known equations.
+
+    Raises
+    ------
+    DfsmError
+        The model is something else, or JAX cannot follow it.
+    """
+    if isinstance(model, DFSM):
+        channels = {g: tuple(getattr(model.signals, g)) for g in GROUPS.values()}
+        ready = model.prepared()
+        return Plant(channels, ready.derivative, ready.output, model.region)
+    if not isinstance(model, ODESystem):
+        raise DfsmError(
+            f"model is a {type(model).__name__}, expected a DFSM or an ODESystem: wrap a function "
+            "f(x, u, w, p) as ODESystem(f, states=…, controls=…)"
+        )
+    if model.backend != "jax":
+        raise DfsmError(
+            f"{model.name}: optimal control needs derivatives of f, which the numpy backend cannot "
+            "give: write f with jax.numpy and set backend to jax"
+        )
+    channels = {g: tuple(getattr(model, g)) for g in GROUPS.values()}
+    g = model.g
+
+    def derivative(x: Any, u: Any, w: Any, p: Any) -> Any:
+        return jnp.asarray(model.f(x, u, w, p), dtype=jnp.float64)
+
+    def output(x: Any, u: Any, w: Any, p: Any) -> Any:
+        return jnp.zeros(0) if g is None else jnp.asarray(g(x, u, w, p), dtype=jnp.float64)
+
+    return Plant(channels, derivative, output, None)
+
+
+class Group:
+    """Scalars by channel name: ``group.GenSpeed``, or ``group["a name with spaces"]``.
+
+    Raises
+    ------
+    DfsmError
+        No such channel in this group; the message says which group has it, or what is near.
+    """
+
+    def __init__(self, letter: str, plant: Plant, values: Any) -> None:
+        self._letter, self._plant, self._values = letter, plant, values
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self[name]
+
+    def __getitem__(self, name: str) -> Any:
+        kind = GROUPS[self._letter]
+        known = self._plant.names(kind)
+        if name in known:
+            return self._values[known.index(name)]
+        owner = self._plant.owner(name)
+        if owner is not None:
+            raise DfsmError(
+                f"'{name}' is one of the {GROUPS[owner]}, not of the {kind}: write {owner}.{name}"
+            )
+        raise DfsmError(f"no channel '{name}' among the {kind}; {near_matches(name, known)}")
+
+
+class Signals:
+    """All signals at one time, as costs and path constraints see them.
+
+    ``s.t`` is the time in s; ``s.x``, ``s.u``, ``s.w``, ``s.p`` and ``s.y`` hold states, controls,
+    disturbances, parameters and outputs by name, in the model's units.
+    """
+
+    def __init__(self, plant: Plant, t: Any, values: Sequence[Any]) -> None:
+        self._plant, self._raw, self.t = plant, tuple(values), t
+        self.x, self.u, self.w, self.p = (
+            Group(letter, plant, v) for letter, v in zip("xuwp", values, strict=True)
+        )
+
+    @property
+    def distance(self) -> Any:
+        """How far states and controls are from the training data: 1 is as far as is usual.
+
+        See `Region.distance_chosen`; 0 without a surrogate.
+        """
+        x, u, w, p = self._raw
+        region = self._plant.region
+        if region is None:
+            return jnp.zeros(())
+        groups = [jnp.asarray(g) for g in (u, w, x, p)]
+        return region.distance_chosen(jnp.concatenate(groups), scheduled(region.schedule, groups))
+
+    @property
+    def y(self) -> Group:
+        """Outputs; they are only evaluated where a function asks for them."""
+        return Group("y", self._plant, self._plant.output(*self._raw))
+
+
+class End:
+    """One end of the horizon, as final costs and boundary constraints see it.
+
+    ``end.t`` is its time in s; ``end.x`` and ``end.p`` hold states and parameters by name.
+    """
+
+    def __init__(self, plant: Plant, t: Any, x: Any, p: Any) -> None:
+        self.t, self.x, self.p = t, Group("x", plant, x), Group("p", plant, p)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise DfsmError(
+            f"the ends of the horizon have t, x and p, not '{name}': functions of controls, "
+            "disturbances and outputs belong in the cost or the path constraints"
+        )

@@ -1,0 +1,1 @@
+"""A problem as a sparse nonlinear program."""

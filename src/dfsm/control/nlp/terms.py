@@ -1,0 +1,330 @@
+"""The functions of a problem as JAX code on small local vectors, compiled once and reused.
+
+A *term* is one function evaluated for many local vectors at once: for all nodes of a mesh, or for
+both ends of every scenario. Values, Jacobians and weighted Hessians come from the same definition,
+and problems that differ only in numbers (bounds, disturbances, mesh) share the compiled code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.control.names import End, Signals
+from dfsm.control.nlp.structure import varies
+from dfsm.control.problem import OptimalControlProblem, is_number
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError
+
+# Rows are evaluated in blocks of few lengths: all meshes of a problem share a compilation, and what
+# hundreds of units need for derivatives stays in the cache.
+_FEW, _SIZES = 8, (128, 256)
+
+# Compiled functions of this many problems are kept.
+_MOST = 32
+_KNOWN: dict[tuple, Functions] = {}
+
+Local = Callable[[jax.Array, Any, Any], jax.Array]
+
+
+class Term:
+    """A function of a local vector, vectorised: ``function(z, data, common)`` to outputs.
+
+    Parameters
+    ----------
+    function
+        Takes a local vector ``(local,)``, data of its row and data common to all rows.
+    parts
+        Functions of the same arguments that give its objective and its constraints, where they
+        can be told apart.
+    """
+
+    def __init__(self, function: Local, parts: tuple[Local, Local] | None = None) -> None:
+        def weighted(z: jax.Array, data: Any, common: Any, weights: jax.Array) -> jax.Array:
+            return weights @ function(z, data, common)
+
+        rows = (0, 0, None)
+        self.parts = parts
+        self._values = jax.jit(jax.vmap(function, rows))
+        # Measured: backwards a third of the time for hundreds of units; forwards through loops.
+        slopes = jax.jacfwd if parts is None else jax.jacrev
+        self._jacobian = jax.jit(jax.vmap(slopes(function), rows))
+        self._hessian = jax.jit(jax.vmap(jax.jacfwd(jax.grad(weighted)), (*rows, 0)))
+
+    def values(self, z: Array, data: Any, common: Any) -> Array:
+        """Outputs ``(row, output)`` at local vectors ``(row, local)``."""
+        return self._padded(self._values, common, z, data)
+
+    def jacobian(self, z: Array, data: Any, common: Any) -> Array:
+        """Jacobians ``(row, output, local)``."""
+        return self._padded(self._jacobian, common, z, data)
+
+    def hessian(self, z: Array, data: Any, common: Any, weights: Array) -> Array:
+        """Hessians of the outputs times weights ``(row, output)``, ``(row, local, local)``."""
+        return self._padded(self._hessian, common, z, data, weights)
+
+    def is_quadratic(self, z: Array, data: Any, common: Any) -> bool:
+        """Whether the objective is at most quadratic and the constraints are affine.
+
+        Proved on the traced code; a False may be overcautious.
+        """
+        if self.parts is None:
+            return False
+        example = (z[0], jax.tree.map(lambda a: a[0], data), common)
+        objective, constraints = self.parts
+        second, first = jax.jacfwd(jax.jacrev(objective)), jax.jacfwd(constraints)
+        return not (varies(second, *example) or varies(first, *example))
+
+    @staticmethod
+    def _padded(function: Callable[..., jax.Array], common: Any, z: Array, *rest: Any) -> Array:
+        count = len(z)
+        size = block_length(count)
+        extra = -count % size
+
+        def pad(a: Array) -> Array:
+            return np.concatenate([a, np.repeat(a[-1:], extra, axis=0)]) if extra else a
+
+        padded = jax.tree.map(pad, (z, *rest))
+        found = []
+        for first in range(0, count, size):
+            part = jax.tree.map(lambda a, k=first: a[k : k + size], padded)
+            found.append(np.asarray(function(part[0], part[1], common, *part[2:])))
+        return (found[0] if len(found) == 1 else np.concatenate(found))[:count]
+
+
+def block_length(count: int) -> int:
+    """Number of rows that are evaluated at once, of `count`."""
+    return count if count <= _FEW else next((n for n in _SIZES if count <= n), _SIZES[-1])
+
+
+# -- the functions of a problem -----------------------------------------------------------------
+
+
+class Functions:
+    """Compiled functions of a problem's nodes and ends.
+
+    The local vector of a node is [x, u, q], that of the ends [x start, x end, q], where q holds
+    the free parameters and, if free, the last time.
+
+    Attributes
+    ----------
+    slopes, node, ends
+        Terms with the outputs ẋ; [T L, T ẋ, path constraints]; [M, boundary constraints].
+    segments
+        Terms of shooting, by what a segment consists of.
+    path_sizes, boundary_sizes
+        Number of values of every constraint by name; bounded outputs are path constraints too.
+    """
+
+    def __init__(self, problem: OptimalControlProblem) -> None:
+        # Kept alive, so that its id is not given to another while this is remembered.
+        self.model, self.plant = problem.model, problem.plant
+        self.nx, self.nu = (len(self.plant.names(g)) for g in ("states", "controls"))
+        names = self.plant.names("parameters")
+        self._free = np.array([names.index(n) for n in problem.free_parameters], dtype=int)
+        self._timed = problem.free_time is not None
+        self._cost, self._final_cost = problem.cost, problem.final_cost
+        self._path = {n: c[0] for n, c in problem.constraints.items()}
+        self._boundary = {n: c[0] for n, c in problem.boundary.items()}
+        self._outputs = tuple(n for n in self.plant.names("outputs") if n in problem.bounds)
+        self.path_sizes, self.boundary_sizes = _sizes(self, problem)
+        self.node = _joined(self._node_cost, self._node_constraints)
+        self.ends = _joined(self._ends_cost, self._ends_constraints)
+        self.slopes = Term(self._slopes_row)
+        self.segments: dict[tuple[int, int], Term] = {}
+
+    def unpack(self, q: jax.Array, common: Any) -> tuple[jax.Array, jax.Array]:
+        """Parameters and the last time from free ones and the fixed values."""
+        p = jnp.asarray(common["p"])
+        if len(self._free):
+            p = p.at[self._free].set(q[: len(self._free)])
+        return p, q[-1] if self._timed else common["stop"]
+
+    def disturbances(self, t: jax.Array, data: Any, common: Any) -> jax.Array:
+        """Those given with the row, or for a free last time those of the table at time t."""
+        if not self._timed:
+            return data["w"]
+        table = common["table"][data["scenario"]]
+        return jax.vmap(lambda v: jnp.interp(t, common["table_time"], v), 1)(table)
+
+    def signals(self, z: jax.Array, data: Any, common: Any) -> tuple[Signals, tuple, jax.Array]:
+        """Named signals of a node, its plain vectors, and the length of the horizon in s."""
+        x, u, q = jnp.split(z, [self.nx, self.nx + self.nu])
+        p, stop = self.unpack(q, common)
+        duration = stop - common["start"]
+        t = common["start"] + data["tau"] * duration
+        vectors = (x, u, self.disturbances(t, data, common), p)
+        return Signals(self.plant, t, vectors), vectors, duration
+
+    def integrand(self, s: Signals) -> jax.Array:
+        """L at a node, shape ``(1,)``."""
+        return scalar(self._cost, "the cost", s) if self._cost else jnp.zeros(1)
+
+    def path(self, s: Signals) -> jax.Array:
+        """All path constraints and bounded outputs at a node, in the order of `path_sizes`."""
+        parts = [vector(f, f"constraint '{n}'", s) for n, f in self._path.items()]
+        parts += [jnp.stack([s.y[n] for n in self._outputs])] if self._outputs else []
+        return jnp.concatenate([jnp.zeros(0), *parts])
+
+    def _node_cost(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
+        s, _, duration = self.signals(z, data, common)
+        return self.integrand(s) * duration
+
+    def _node_constraints(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
+        s, vectors, duration = self.signals(z, data, common)
+        return jnp.concatenate([self.plant.derivative(*vectors) * duration, self.path(s)])
+
+    def _slopes_row(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
+        return self.plant.derivative(*self.signals(z, data, common)[1])
+
+    def end_pair(self, z: jax.Array, common: Any) -> tuple[End, End]:
+        """Named signals of both ends."""
+        first, last, q = jnp.split(z, [self.nx, 2 * self.nx])
+        p, stop = self.unpack(q, common)
+        return End(self.plant, common["start"], first, p), End(self.plant, stop, last, p)
+
+    def _ends_cost(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
+        if self._final_cost is None:
+            return jnp.zeros(1)
+        return scalar(self._final_cost, "the final cost", *self.end_pair(z, common))
+
+    def _ends_constraints(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
+        ends = self.end_pair(z, common)
+        parts = [vector(f, f"boundary '{n}'", *ends) for n, f in self._boundary.items()]
+        return jnp.concatenate([jnp.zeros(0), *parts])
+
+
+def _joined(objective: Local, constraints: Local) -> Term:
+    """A term whose first output is the objective's."""
+
+    def both(z: jax.Array, data: Any, common: Any) -> jax.Array:
+        return jnp.concatenate([f(z, data, common) for f in (objective, constraints)])
+
+    return Term(both, (objective, constraints))
+
+
+def functions_of(problem: OptimalControlProblem) -> Functions:
+    """Compiled functions of a problem, shared with others that differ only in numbers."""
+    key = (
+        id(problem.model),
+        problem.cost,
+        problem.final_cost,
+        tuple((n, c[0]) for n, c in problem.constraints.items()),
+        tuple((n, c[0]) for n, c in problem.boundary.items()),
+        tuple(n for n in problem.plant.names("outputs") if n in problem.bounds),
+        problem.free_parameters,
+        problem.free_time is None,
+    )
+    if key not in _KNOWN:
+        while len(_KNOWN) >= _MOST:
+            del _KNOWN[next(iter(_KNOWN))]
+        _KNOWN[key] = Functions(problem)
+    return _KNOWN[key]
+
+
+# -- calling what a user wrote ------------------------------------------------------------------
+
+
+def vector(function: Callable[..., Any], what: str, *arguments: Any) -> jax.Array:
+    """Call a user's function; a number or an array becomes a vector.
+
+    Raises
+    ------
+    DfsmError
+        The function names an unknown signal, or is not written with jax.numpy.
+    """
+    try:
+        value = function(*arguments)
+        value = jnp.stack(value) if isinstance(value, list | tuple) else jnp.asarray(value)
+    except DfsmError as error:
+        raise DfsmError(f"{what}: {error}") from None
+    except jax.errors.JAXTypeError as error:
+        reason = str(error).split("\n")[0]
+        raise DfsmError(
+            f"{what} cannot be followed by JAX ({reason}): write it with jax.numpy, and jnp.where "
+            "in place of if"
+        ) from None
+    except TypeError as error:
+        raise DfsmError(f"{what} cannot be evaluated: {error}") from None
+    return value.astype(jnp.float64).ravel()
+
+
+def scalar(function: Callable[..., Any], what: str, *arguments: Any) -> jax.Array:
+    """Call a user's function that returns one number, shape ``(1,)``."""
+    value = vector(function, what, *arguments)
+    if value.shape != (1,):
+        raise DfsmError(f"{what} returns {value.size} values, expected one number")
+    return value
+
+
+def _sizes(
+    functions: Functions, problem: OptimalControlProblem
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Number of values of every path and boundary constraint; refuse those without an effect."""
+    example = example_of(functions, problem)
+    z, data, common = example["node"]
+    ends = example["ends"]
+
+    def node(function: Callable[..., Any], what: str) -> jax.Array:
+        return vector(function, what, functions.signals(z, data, common)[0])
+
+    def both(function: Callable[..., Any], what: str) -> jax.Array:
+        return vector(function, what, *functions.end_pair(ends, common))
+
+    path, boundary = {}, {}
+    for place, call, sizes in (("constraints", node, path), ("boundary", both, boundary)):
+        for name, (function, *_) in getattr(problem, place).items():
+            # What does not become NaN when all that can be chosen is NaN depends on nothing.
+            value = np.asarray(call(function, f"{place} '{name}'"))
+            fixed = np.flatnonzero(~np.isnan(value))
+            if len(fixed) or not value.size:
+                which = f"value {fixed[0]} of " if value.size > 1 else ""
+                raise DfsmError(
+                    f"{problem.name}: {which}{place} '{name}' depends on nothing that can be "
+                    "chosen: leave it out, or use a state, control or free parameter in it"
+                )
+            sizes[name] = value.size
+    path |= {name: 1 for name in functions._outputs}
+    if problem.cost:
+        scalar(problem.cost, "the cost", functions.signals(z, data, common)[0])
+    if problem.final_cost:
+        scalar(problem.final_cost, "the final cost", *functions.end_pair(ends, common))
+    return path, boundary
+
+
+def example_of(functions: Functions, problem: OptimalControlProblem) -> dict[str, Any]:
+    """Arguments of a node and of the ends in which all that can be chosen is NaN."""
+    common = common_of(problem)
+    extra = len(problem.free_parameters) + (problem.free_time is not None)
+    data = {"tau": jnp.array(0.5), "scenario": 0}
+    data["w"] = jnp.ones(len(problem.plant.names("disturbances")))
+    node = jnp.full(functions.nx + functions.nu + extra, jnp.nan)
+    ends = jnp.full(2 * functions.nx + extra, jnp.nan)
+    return {"node": (node, data, common), "ends": ends}
+
+
+def common_of(problem: OptimalControlProblem) -> dict[str, Array]:
+    """Numbers that all nodes share: fixed parameters, horizon, table of disturbances."""
+    given = (problem.parameters[n] for n in problem.plant.names("parameters"))
+    fixed = [float(v) if is_number(v) else np.nan for v in given]
+    common = {
+        "p": np.array(fixed, dtype=np.float64),
+        "start": np.float64(problem.start),
+        "stop": np.float64(problem.last_time),
+    }
+    if problem.free_time is not None:
+        names = problem.plant.names("disturbances")
+        runs = [r for r in problem.scenarios if r is not None and names]
+        time = np.unique(np.concatenate([r.time for r in runs])) if runs else np.zeros(2)
+        inside = [r.select(names) for r in runs]
+        values = [
+            np.stack([np.interp(time, r.time, c) for c in r.values.T], axis=1) for r in inside
+        ]
+        common["table_time"] = time
+        common["table"] = np.stack(values) if values else np.zeros((len(problem.scenarios), 2, 0))
+    return common

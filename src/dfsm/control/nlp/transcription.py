@@ -1,0 +1,231 @@
+"""Direct transcription: states and controls at the nodes of a mesh are the variables of an NLP.
+
+    minimise M + T Σ bᵢ L(τᵢ)     subject to     D X − T A F(X, U) = 0  in every interval
+
+and path constraints at the nodes, boundary constraints and rates of controls (Sec. 4; Betts 2010,
+Ch. 4). Which scheme it is only enters through the matrices of the `Grid`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dfsm.control.guess import Start
+from dfsm.control.mesh.grid import Grid, grid_of
+from dfsm.control.mesh.schemes import Kind
+from dfsm.control.nlp import constraints
+from dfsm.control.nlp.layout import Layout
+from dfsm.control.nlp.program import Block, Program
+from dfsm.control.nlp.terms import common_of, functions_of
+from dfsm.control.problem import OptimalControlProblem
+from dfsm.core.settings import require, settings_class
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+
+
+@settings_class
+class DirectTranscription:
+    """How to transcribe a problem, and how accurately.
+
+    Attributes
+    ----------
+    scheme
+        ``"hermite_simpson"`` (order 4), ``"radau"`` (order 2 `degree` − 1) or ``"trapezoidal"``
+        (order 2).
+    degree
+        Of Radau's polynomials.
+    mesh
+        Number of equal intervals, or edges as fractions of the horizon, from 0 to 1.
+    refine
+        Cut intervals until the relative local error of every one is below this; None keeps the
+        mesh as it is. The error is ∫ |ẋ − f| dt over an interval, relative to the largest value
+        of each state (Betts 2010, Sec. 4.7).
+    most_refinements
+        Meshes tried after the first.
+    stay_inside
+        Keep measured states, controls and free parameters inside a surrogate's training range, and
+        their combinations near what occurred there, see `Region.distance_chosen`.
+    tolerance
+        Of the scaled optimality conditions.
+    most_iterations
+        Of the solver, on each mesh.
+    """
+
+    scheme: Kind = "hermite_simpson"
+    degree: int = 3
+    mesh: int | Sequence[float] = 20
+    refine: float | None = 1e-6
+    most_refinements: int = 8
+    stay_inside: bool = False
+    tolerance: float = 1e-8
+    most_iterations: int = 500
+
+    def __post_init__(self) -> None:
+        require(1 <= self.degree <= 12, "degree", self.degree, "1 to 12")
+        require(self.refine is None or self.refine > 0, "refine", self.refine, "more than 0")
+        require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
+        require(self.most_iterations >= 1, "most_iterations", self.most_iterations, "at least 1")
+        require(self.most_refinements >= 0, "most_refinements", self.most_refinements, "0 or more")
+        self.grid()
+
+    def grid(self) -> Grid:
+        """The first mesh."""
+        return grid_of(self.scheme, self.degree, self.mesh)
+
+
+class Transcription:
+    """A problem on one mesh, as a nonlinear program.
+
+    Parameters
+    ----------
+    problem, grid
+        What, and where.
+    start
+        Gives the sizes of variables that have no bounds.
+    stay_inside
+        See `DirectTranscription`.
+    """
+
+    def __init__(
+        self, problem: OptimalControlProblem, grid: Grid, start: Start, stay_inside: bool = False
+    ) -> None:
+        self.problem, self.grid = problem, grid
+        self.functions = functions_of(problem)
+        nodes = np.arange(len(grid.tau))
+        places = grid.tau, nodes, grid.control_node
+        layout = Layout(problem, self.functions, *places, start, stay_inside)
+        self.layout = replace(layout, known=problem.latent_paths(layout.time))
+        self.common = common_of(problem)
+        self.program = self._program()
+
+    def _program(self) -> Program:
+        layout, functions = self.layout, self.functions
+        low, high = layout.limits()
+        scale = layout.scale(low, high)
+        outputs = 1 + functions.nx + sum(functions.path_sizes.values())
+        end_outputs = 1 + sum(functions.boundary_sizes.values())
+        # Constraints hold where there is a control; they come after the cost and the slopes.
+        at = np.arange(layout.scenarios)[:, None] * layout.nodes + layout.control_nodes
+        parts = [
+            constraints.defects(layout, self.grid, scale, outputs),
+            constraints.path(layout, layout.control_nodes, at * outputs + 1 + functions.nx),
+            constraints.boundary(layout, end_outputs),
+            *constraints.rates(layout, scale),
+        ]
+        weights = self.problem.scenario_weights
+        c = np.zeros((layout.scenarios, layout.nodes, outputs))
+        c[..., 0] = weights[:, None] * self.grid.weights
+        x, u, _ = layout.columns
+        local = np.concatenate([x, u, layout.shared], axis=2)
+        nodes = Block(
+            functions.node,
+            local.reshape(-1, local.shape[2]),
+            node_data(self.problem, layout.tau, layout.time),
+            self.common,
+            constraints.stacked(parts, "node", c.size),
+            c.ravel(),
+        )
+        program = constraints.program_of(layout, parts, nodes, self.common, (low, high, scale))
+        z = np.ones(layout.count)
+        program.linear_quadratic = all(
+            b.term.is_quadratic(z[b.columns], b.data, b.common) for b in program.blocks
+        )
+        return program
+
+    # -- values at the nodes --------------------------------------------------------------------
+
+    @property
+    def tau(self) -> Array:
+        """Normalised times of the nodes."""
+        return self.grid.tau
+
+    def scaled(self, start: Start) -> Array:
+        """The solver's variables at given values, moved within their bounds."""
+        return self.program.scaled(self.layout.pack(start))
+
+    def unscaled(self, z: Array) -> Start:
+        """Values at the nodes; a control that is not a variable is extrapolated within bounds."""
+        start = self.layout.unpack(self.program.physical(z))
+        if self.grid.scheme.starts:
+            return start
+        low, high = self.layout.limits()
+        u = self.layout.columns[1][:, 0]
+        first = np.stack([self.grid.controls(U, self.tau[:1])[0] for U in start.U])
+        start.U[:, 0] = np.clip(first, low[u], high[u])
+        return start
+
+    def costates(self, multipliers: Array) -> tuple[Trajectory, ...]:
+        """∂J/∂ξ from the multipliers of the defects, per scenario.
+
+        Radau's belong to its collocation points (Garg et al. 2011), the others' to the middles of
+        the intervals. States that are known beforehand have none.
+        """
+        layout, grid = self.layout, self.grid
+        defects, states = len(grid.scheme.D), len(layout.solved)
+        shape = (layout.scenarios, grid.intervals, defects, states)
+        values = -multipliers[: int(np.prod(shape))].reshape(shape)
+        if grid.kind == "radau":
+            values = values / grid.scheme.weights[1:, None]
+            tau = grid.tau[1:]
+        else:
+            values, tau = values[:, :, -1:], grid.edges[:-1] + grid.lengths / 2
+        values = values.reshape(layout.scenarios, -1, states)
+        return layout.costates(tau, values)
+
+    def slopes(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
+        """State derivatives with normalised time, for states and controls at given times.
+
+        Parameters
+        ----------
+        X, U
+            Shape ``(scenario, time, n)``.
+        start
+            Holds the free parameters and the last time.
+        tau
+            Shape ``(time,)``.
+        """
+        time = self.problem.start + tau * (start.stop - self.problem.start)
+        shared = [*start.p, *([start.stop] if self.layout.free_time else [])]
+        rows = (*X.shape[:2], len(shared))
+        local = np.concatenate([X, U, np.broadcast_to(shared, rows)], axis=2)
+        data = node_data(self.problem, tau, time)
+        flat = local.reshape(-1, local.shape[2])
+        found = self.functions.slopes.values(flat, data, self.common)
+        return found.reshape(X.shape) * (start.stop - self.problem.start)
+
+    def errors(self, start: Start) -> Array:
+        """Relative local error of every interval, the worst of all states and scenarios."""
+        grid, count = self.grid, self.layout.scenarios
+        F = self.slopes(start.X, start.U, start, grid.tau)
+        seen = [grid.at_checked(*a) for a in zip(start.X, F, start.U, strict=True)]
+        tau = seen[0][0].ravel()
+        X, dX, U = (np.stack([s[k] for s in seen]) for k in (1, 2, 3))
+        f = self.slopes(
+            X.reshape(count, len(tau), -1), U.reshape(count, len(tau), -1), start, tau
+        ).reshape(X.shape)
+        missing = np.einsum("g,skgx->skx", grid.checked[1], np.abs(dX - f)) * grid.lengths[:, None]
+        size = np.maximum(np.abs(start.X).max(axis=(0, 1)), 1e-3 * self._sizes())
+        return (missing / size)[..., self.layout.solved].max(axis=(0, 2))
+
+    def _sizes(self) -> Array:
+        return self.program.scale[self.layout.columns[0][0, 0]]
+
+
+def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Any]:
+    """What every node of every scenario is given: its time and its disturbances."""
+    names = problem.plant.names("disturbances")
+    count = len(problem.scenarios)
+    w = np.zeros((count, len(tau), len(names)))
+    for s, run in enumerate(problem.scenarios):
+        if run is not None:
+            for i, name in enumerate(names):
+                w[s, :, i] = np.interp(time, run.time, run[name])
+    return {
+        "tau": np.tile(tau, count),
+        "scenario": np.repeat(np.arange(count), len(tau)),
+        "w": w.reshape(count * len(tau), len(names)),
+    }

@@ -1,0 +1,101 @@
+"""Arrays in safetensors and a readable JSON manifest, together in a folder.
+
+Nothing in the folder is executed when it is read, and damage is told from the digests.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from dfsm.core.files import check_format, json_bytes, json_value, write_folder
+from dfsm.core.types import Array
+from dfsm.core.version import __version__
+from dfsm.errors import DfsmError
+
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """One kind of folder.
+
+    Attributes
+    ----------
+    tensors
+        Name of the file with the arrays.
+    format
+        Newest number of the manifest's layout that can be read.
+    cure
+        What else than restoring the folder helps when it is damaged.
+    """
+
+    tensors: str
+    format: int
+    cure: str
+
+    def write(
+        self,
+        path: str | Path,
+        tensors: Mapping[str, Array],
+        content: Mapping[str, Any],
+        is_ours: Callable[[Path], bool],
+    ) -> None:
+        """Write a folder in one step, in the place of one that `is_ours`."""
+        arrays = {name: np.ascontiguousarray(a) for name, a in tensors.items()}
+        with write_folder(path, is_ours=is_ours) as folder:
+            save_file(arrays, folder / self.tensors)
+            manifest: dict[str, Any] = {
+                "format": self.format,
+                "dfsm": __version__,
+                "sha256": hashlib.sha256((folder / self.tensors).read_bytes()).hexdigest(),
+                **content,
+            }
+            manifest["checksum"] = _checksum(manifest)
+            (folder / MANIFEST).write_bytes(json_bytes(manifest))
+
+    def read_manifest(self, path: Path) -> dict[str, Any]:
+        """Read and check the manifest of a folder that holds one."""
+        try:
+            manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise self.damaged(path, f"{MANIFEST} cannot be read ({error})") from None
+        version = manifest.get("format") if isinstance(manifest, dict) else None
+        if not isinstance(version, int):
+            raise self.damaged(path, f"{MANIFEST} states no format number")
+        check_format(path, version, self.format)
+        if manifest.get("checksum") != _checksum(manifest):
+            raise self.damaged(path, f"{MANIFEST} is not as it was written")
+        return manifest
+
+    def read_tensors(self, path: Path, manifest: Mapping[str, Any]) -> dict[str, Array]:
+        """Read the arrays that the manifest was written for."""
+        file = path / self.tensors
+        try:
+            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        except OSError as error:
+            raise self.damaged(path, f"{file.name} cannot be read ({error.strerror})") from None
+        if digest != manifest.get("sha256"):
+            raise self.damaged(path, f"{file.name} is not the file that {MANIFEST} was written for")
+        try:
+            return load_file(file)
+        except SafetensorError as error:
+            raise self.damaged(path, f"{file.name} cannot be read ({error})") from None
+
+    def damaged(self, path: Path, what: str) -> DfsmError:
+        """The error about a folder that is not as it was written."""
+        return DfsmError(f"{path} is damaged: {what}; {self.cure} or restore the folder")
+
+
+def _checksum(manifest: Mapping[str, Any]) -> str:
+    """Digest of all that a manifest says, however its JSON is laid out."""
+    said = {k: v for k, v in manifest.items() if k != "checksum"}
+    return hashlib.sha256(json.dumps(json_value(said), sort_keys=True).encode()).hexdigest()

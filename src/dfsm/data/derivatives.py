@@ -1,0 +1,339 @@
+"""State derivatives from recorded states, ξ(t) → ξ̇(t): Sec. 3.3 of the paper.
+
+`differentiate` takes a run and a list of states and returns the run with smoothed states, rates
+appended as states where asked for, and the derivative of every state at every sample. The default
+is a smoothing spline that knows the file's quantisation (`smoothing.py`); the paper's cubic spline
+is there too. It interpolates, so it differentiates rounding errors along with the signal.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from dfsm.core.settings import settings_class
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError, near_matches
+from dfsm.numerics.filters import Filter, filtered
+from dfsm.numerics.smoothing import SmoothResult, cubic_spline, interpolate, smoothing_spline
+
+__all__ = [
+    "DerivativeSettings",
+    "Differentiated",
+    "Filter",
+    "SmoothResult",
+    "StateSpec",
+    "cubic_spline",
+    "differentiate",
+    "kinematic_rows",
+    "smoothing_spline",
+    "state_names",
+    "state_units",
+]
+
+
+@settings_class
+class StateSpec:
+    """One recorded state, or with ``order=2`` a state and its rate.
+
+    Attributes
+    ----------
+    name
+        Channel that holds the state q.
+    order
+        1: q is a state, q̇ its derivative. 2: q and q̇ are states, with derivatives q̇ and q̈.
+    rate, acceleration
+        Channels that hold q̇ and q̈ as the simulator computed them; where given they are used
+        instead of differentiating (`acceleration` only with ``order=2``). The units must be the
+        state's unit per s and per s².
+
+    Raises
+    ------
+    DfsmError
+        An order other than 1 or 2, or an acceleration for a state of order 1.
+    """
+
+    name: str
+    order: Literal[1, 2] = 1
+    rate: str | None = None
+    acceleration: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.order not in (1, 2):
+            raise DfsmError(f"state '{self.name}' has order {self.order!r}: give 1 or 2")
+        if self.order == 1 and self.acceleration is not None:
+            raise DfsmError(
+                f"state '{self.name}' of order 1 has no use for the acceleration channel "
+                f"'{self.acceleration}': set order to 2 or leave the channel out"
+            )
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Recorded channels that the state and its derivatives are taken from."""
+        return tuple(n for n in (self.name, self.rate, self.acceleration) if n is not None)
+
+
+@settings_class
+class DerivativeSettings:
+    """How states are differentiated.
+
+    Attributes
+    ----------
+    method
+        ``smoothing_spline``, the noise-aware default, or ``cubic_spline``, the paper's.
+    filters
+        State channel → `Filter`, for states that hold motions a model should not follow.
+    """
+
+    method: Literal["smoothing_spline", "cubic_spline"] = "smoothing_spline"
+    filters: Mapping[str, Filter] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        methods = ("smoothing_spline", "cubic_spline")
+        if self.method not in methods:
+            raise DfsmError(
+                f"there is no method '{self.method}' to differentiate with; "
+                f"{near_matches(str(self.method), methods)}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Differentiated:
+    """A run with its states and their derivatives.
+
+    Attributes
+    ----------
+    trajectory
+        The run with smoothed states in place of the recorded ones, and the rates of states of
+        order 2 appended as channels ``<name>_dot``.
+    names
+        States in the paper's order: all q, then the rates, ξ = [Θp, ωg, Θ̇p, ω̇g].
+    derivatives
+        ξ̇, shape ``(time, state)``, in `derivative_units`.
+    derivative_names, derivative_units
+        ``<name>_dot`` or ``<name>_ddot``, and the state's unit per s.
+    noise_std
+        Per state the standard deviation of the noise in the recorded channel, in its unit; None
+        where it is not known (cubic spline, rates, recorded channels).
+    """
+
+    trajectory: Trajectory
+    names: tuple[str, ...]
+    derivatives: Array
+    derivative_names: tuple[str, ...]
+    derivative_units: tuple[str, ...]
+    noise_std: tuple[float | None, ...]
+
+
+def state_names(states: Sequence[StateSpec]) -> tuple[str, ...]:
+    """Names of ξ in the paper's order: all q first, then the rates of states of order 2.
+
+    Raises
+    ------
+    DfsmError
+        No state, a state given twice, or one that bears the name of another's rate.
+    """
+    names = (*(s.name for s in states), *(f"{s.name}_dot" for s in states if s.order == 2))
+    if not names:
+        raise DfsmError("no states were given: name at least one channel as a state")
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise DfsmError(f"state '{name}' was given twice: name each state once")
+    return names
+
+
+def state_units(states: Sequence[StateSpec], trajectory: Trajectory) -> tuple[str, ...]:
+    """Units of ξ in the order of `state_names`; a state without a unit has a rate without one.
+
+    Raises
+    ------
+    DfsmError
+        A channel that the run does not have.
+    """
+    units = [trajectory.channel(s.name).unit for s in states]
+    rates = [per_second(u) for s, u in zip(states, units, strict=True) if s.order == 2]
+    return (*units, *rates)
+
+
+def kinematic_rows(states: Sequence[StateSpec]) -> dict[int, int]:
+    """Rows of ξ̇ that are states themselves: ``{index of q: index of q̇}``, nothing to fit."""
+    second = [i for i, s in enumerate(states) if s.order == 2]
+    return {i: len(states) + j for j, i in enumerate(second)}
+
+
+def differentiate(
+    trajectory: Trajectory,
+    states: Sequence[StateSpec],
+    settings: DerivativeSettings | None = None,
+) -> Differentiated:
+    """Find the states and their derivatives of one run.
+
+    A recorded rate or acceleration is used as it stands (filtered where the state is), except
+    that a recorded rate which must itself be differentiated is smoothed like a state.
+    With a filter the state is first freed of noise, then filtered, then differentiated, so that
+    q̇ stays the derivative of q. Smooth the whole run and cut the time window afterwards: the
+    second derivative is least certain in the last few samples.
+
+    Parameters
+    ----------
+    trajectory
+        The run; each state channel's quantisation step, if known, gives its noise level.
+    states
+        See `StateSpec`.
+    settings
+        See `DerivativeSettings`; None takes the defaults.
+
+    Returns
+    -------
+    Differentiated
+        Derivatives of shape ``(time, state)``, and the run with the states in it.
+
+    Raises
+    ------
+    DfsmError
+        An unknown channel or filter, a channel with NaN, a constant state, units that disagree,
+        a name that is taken, or too few samples.
+    """
+    settings = settings or DerivativeSettings()
+    names = state_names(states)
+    _check_names(trajectory, states, settings)
+    found = [_differentiate_state(trajectory, s, settings) for s in states]
+    second = [i for i, s in enumerate(states) if s.order == 2]
+
+    values = trajectory.values.copy()
+    channels = list(trajectory.channels)
+    for spec, state in zip(states, found, strict=True):
+        column = trajectory.column(spec.name)
+        values[:, column] = state.q
+        channels[column] = replace(channels[column], step=None)
+    smoothed = replace(trajectory, values=values, channels=tuple(channels))
+    rates = [
+        replace(trajectory.channel(s.name), name=f"{s.name}_dot", unit=unit, step=None)
+        for s, unit in zip(
+            (states[i] for i in second), state_units(states, trajectory)[len(states) :], strict=True
+        )
+    ]
+    if second:
+        smoothed = smoothed.with_channels(rates, np.stack([found[i].rate for i in second], axis=1))
+    derivatives = [*(f.rate for f in found), *(found[i].acceleration for i in second)]
+    return Differentiated(
+        trajectory=smoothed,
+        names=names,
+        derivatives=np.stack(derivatives, axis=1),
+        derivative_names=(
+            *(f"{s.name}_dot" for s in states),
+            *(f"{states[i].name}_ddot" for i in second),
+        ),
+        derivative_units=tuple(per_second(u) for u in state_units(states, trajectory)),
+        noise_std=(*(f.noise_std for f in found), *(None for _ in second)),
+    )
+
+
+# -- one state ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    q: Array
+    rate: Array
+    acceleration: Array
+    noise_std: float | None
+
+
+def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeSettings) -> _State:
+    run.select(spec.channels).require_finite()
+    chosen = settings.filters.get(spec.name)
+    state = _estimate(run, spec.name, chosen, settings)
+    if spec.rate is not None:
+        _check_unit(run, spec, spec.rate, 1)
+        if spec.order == 2 and spec.acceleration is None:
+            rate = _estimate(run, spec.rate, chosen, settings)
+            state = replace(state, rate=rate.q, acceleration=rate.rate)
+        else:
+            state = replace(state, rate=filtered(run.time, run[spec.rate], chosen))
+    if spec.acceleration is not None:
+        _check_unit(run, spec, spec.acceleration, 2)
+        recorded = filtered(run.time, run[spec.acceleration], chosen)
+        state = replace(state, acceleration=recorded)
+    # The rate of a state of order 1 is only a derivative, and that may be constant.
+    checks = [(state.q, "state"), (state.rate, "rate of state")][: spec.order]
+    for values, what in checks:
+        if np.ptp(values) <= 1e-12 * np.abs(values).max():
+            raise DfsmError(
+                f"{run.where}: {what} '{spec.name}' is constant, so nothing can be learnt about "
+                "its derivative: choose another state, another filter or leave the run out"
+            )
+    return state
+
+
+def _estimate(
+    run: Trajectory, name: str, chosen: Filter | None, settings: DerivativeSettings
+) -> _State:
+    time, values = run.time, run[name]
+    try:
+        if settings.method == "cubic_spline":
+            return _State(*cubic_spline(time, filtered(time, values, chosen)), None)
+        smooth = smoothing_spline(time, values, run.channel(name).step)
+        if chosen is None:
+            return _State(smooth.values, smooth.first, smooth.second, smooth.noise_std)
+        filtered_values = filtered(time, smooth.values, chosen)
+        return _State(*interpolate(time, filtered_values), smooth.noise_std)
+    except DfsmError as error:
+        raise DfsmError(f"{run.where}: channel '{name}': {error}") from None
+
+
+# -- names and units ----------------------------------------------------------------------------
+
+
+def _check_names(
+    run: Trajectory, states: Sequence[StateSpec], settings: DerivativeSettings
+) -> None:
+    run.columns(n for spec in states for n in spec.channels)
+    for spec in states:
+        if spec.order == 2 and f"{spec.name}_dot" in run:
+            raise DfsmError(
+                f"{run.where}: there is a channel '{spec.name}_dot' already, the name that the "
+                f"rate of '{spec.name}' gets: rename it, or give it as the state's rate under "
+                "another name"
+            )
+    known = [s.name for s in states]
+    for name in settings.filters:
+        if name not in known:
+            raise DfsmError(
+                f"a filter was given for '{name}', which is no state; {near_matches(name, known)}"
+            )
+
+
+def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None:
+    """Compare units; one that a file does not state cannot be compared and passes."""
+    unit, given = run.channel(spec.name).unit, run.channel(name).unit
+    wanted = unit
+    for _ in range(times):
+        wanted = per_second(wanted)
+    if unit and given and _time_power(given) != _time_power(wanted):
+        raise DfsmError(
+            f"{run.where}: channel '{name}' in '{given}' is not the "
+            f"{('first', 'second')[times - 1]} derivative of '{spec.name}' in '{unit}': a channel "
+            f"in '{wanted}' is expected, name another or leave it out"
+        )
+
+
+def per_second(unit: str) -> str:
+    """Append one ``/s``: deg → deg/s → deg/s^2; no unit stays no unit."""
+    if not unit:
+        return ""
+    base, power = _time_power(unit)
+    return f"{base}/s" if power == 0 else f"{base}/s^{power + 1}"
+
+
+def _time_power(unit: str) -> tuple[str, int]:
+    """Split 'deg/s^2', 'deg/s2', 'deg/s²', 'deg/s**2' or 'deg/s/s' into ('deg', 2)."""
+    base, power = unit.strip().replace("²", "2").replace("³", "3"), 0
+    while match := re.fullmatch(r"(.+?)\s*/\s*s(?:ec)?(?:\^|\*\*)?(\d?)", base):
+        base, power = match[1], power + int(match[2] or 1)
+    return base, power

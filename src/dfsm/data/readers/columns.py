@@ -1,0 +1,100 @@
+"""Columns of a table: which one is time, and the unit that a header holds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Channel
+from dfsm.errors import DfsmError
+
+# The name, one separator at most, and the unit in brackets at the end.
+HEADER = re.compile(r"(.+?)[_ ]?(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+TIME_NAMES = ("time", "t")
+# What pandas calls a column that it saved or read without a name, and a name left blank.
+INDEX = re.compile(r"|unnamed: \d+|__index_level_\d+__", re.IGNORECASE)
+SECONDS = ("", "s", "sec", "second", "seconds")
+
+
+def split_header(text: str) -> tuple[str, str]:
+    """Split ``Name [unit]``, ``Name (unit)`` or ``Name_[unit]`` into name and unit ("" if none)."""
+    text = text.strip()
+    match = HEADER.fullmatch(text)
+    if match is None:
+        return text, ""
+    return match[1], (match[2] if match[2] is not None else match[3]).strip()
+
+
+def kept_columns(
+    path: Path, channels: Sequence[Channel], columns: Sequence[Array], time: int | None
+) -> tuple[list[int], list[str]]:
+    """Columns that hold signals, and what there is to tell about the others.
+
+    A table saved with its row numbers (the index of pandas) and a separator at the end of every
+    line give columns that nobody asked for: these are left out.
+
+    Parameters
+    ----------
+    path
+        The file.
+    channels, columns
+        Header and samples of every column.
+    time
+        Which of them is the time, if one is.
+
+    Raises
+    ------
+    DfsmError
+        A column without a name holds something else.
+    """
+    keep: list[int] = []
+    notes: list[str] = []
+    for i, (channel, values) in enumerate(zip(channels, columns, strict=True)):
+        if i == time:
+            continue
+        if not INDEX.fullmatch(channel.name):
+            keep.append(i)
+        elif _numbers_rows(values):
+            notes.append(f"column {i + 1} left out: it numbers the rows, as a saved index does")
+        elif channel.name:
+            keep.append(i)
+        elif np.isnan(values).all():
+            notes.append(f"column {i + 1} left out: it has no name and no values")
+        else:
+            raise DfsmError(
+                f"{path}: column {i + 1} has no name: give it one in the header, or remove it"
+            )
+    return keep, notes
+
+
+def _numbers_rows(values: Array) -> bool:
+    """Whether samples are whole numbers that increase: rows that were dropped leave holes."""
+    whole = np.isfinite(values).all() and np.array_equal(values, np.floor(values))
+    return bool(whole and (np.diff(values) > 0).all())
+
+
+def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TIME_NAMES) -> int:
+    """Return the column that holds the time.
+
+    Raises
+    ------
+    DfsmError
+        There is none, or its unit is not s.
+    """
+    for i, channel in enumerate(channels):
+        if channel.name.lower() in names:
+            if channel.unit.lower() not in SECONDS:
+                raise DfsmError(
+                    f"{path}: its time '{channel.name}' is in '{channel.unit}', expected s: "
+                    "convert it"
+                )
+            return i
+    shown = ", ".join(c.name or "(no name)" for c in channels[:12])
+    shown += ", …" if len(channels) > 12 else ""
+    raise DfsmError(
+        f"{path}: no time column, expected one called Time, time or t (in s), found: {shown[:400]}"
+    )

@@ -1,0 +1,293 @@
+"""OpenFAST results: binary `.outb` (formats 1 to 4), text `.out`, and binary under the name `.out`.
+
+openfast-io decodes the samples but validates nothing, so a file is checked against its own header
+before that library sees it. Layout of the binary formats: `ReadFASTbinary.m` of NREL's
+matlab-toolbox and `WrBinFAST` in OpenFAST's NWTC library.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from dfsm.core.files import existing_file
+from dfsm.core.types import Array
+from dfsm.data.readers.assemble import assemble
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.errors import DfsmError
+
+WITH_TIME, WITHOUT_TIME, UNCOMPRESSED, WIDE_NAMES = 1, 2, 3, 4
+DEFAULT_NAME_WIDTH = 10
+# OpenFAST uses 10 or 20 characters; anything far above is a corrupted header, not a name.
+MAX_NAME_WIDTH = 1024
+HEADER_LINES = 200
+
+
+def read_openfast(path: str | Path) -> Trajectory:
+    """Read one OpenFAST result file.
+
+    Whether a file is binary or text is told from its content, not its name. Channels of the
+    16-bit formats carry the quantisation step that the file's scale factors state; uncompressed
+    (format 3), text and constant channels carry none.
+
+    Parameters
+    ----------
+    path
+        An `.outb` or `.out` file.
+
+    Returns
+    -------
+    Trajectory
+        All channels but time and those marked `Invalid`; values have shape ``(time, channel)``
+        in the units of the file. NaN is kept as it is.
+
+    Raises
+    ------
+    DfsmError
+        The file is missing, foreign, truncated or does not match its header; a text row is
+        ragged or holds something that is no number (the line is named); time does not increase;
+        openfast-io is not installed.
+    """
+    path = existing_file(path)
+    with path.open("rb") as stream:
+        start = stream.read(4096)
+    # Text never holds a zero byte; the second byte of every binary format id is one.
+    if path.suffix.lower() == ".outb" or b"\0" in start:
+        return _read_binary(path)
+    return _read_text(path)
+
+
+# -- binary -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Header:
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    scales: tuple[float, ...] | None
+
+
+def _read_binary(path: Path) -> Trajectory:
+    header = _check_header(path)
+    load = _library("load_binary_output")
+    try:
+        # A channel that was NaN throughout leaves a useless scale factor: no reason to warn here.
+        with np.errstate(all="ignore"):
+            data, _, packed = load(str(path))
+    except (OSError, ValueError, IndexError, OverflowError, MemoryError, struct.error) as error:
+        raise DfsmError(
+            f"{path} could not be decoded ({error}): it may have changed meanwhile; try again"
+        ) from error
+    values = np.array(data[:, 1:], dtype=np.float64)
+    codes = packed[:, 1:]
+    notes = []
+    channels = []
+    for i, (name, unit) in enumerate(zip(header.names, header.units, strict=True)):
+        step = None
+        if header.scales is not None:
+            if header.scales[i] == 0 or not np.isfinite(values[:, i]).all():
+                values[:, i] = np.nan
+                notes.append(
+                    f"channel '{name}' has no usable scale factor in the file, its samples are NaN"
+                )
+            else:
+                step = _step(values[:, i], codes[:, i])
+        channels.append(Channel(name, unit, step))
+    return assemble(path, data[:, 0], values, channels, notes=notes)
+
+
+def _step(values: Array, codes: Array) -> float | None:
+    """Slope of value over code between the extremes; None for a constant channel."""
+    low, high = int(codes.argmin()), int(codes.argmax())
+    if codes[low] == codes[high]:
+        return None
+    return float(abs(values[high] - values[low]) / (codes[high] - codes[low])) or None
+
+
+def _check_header(path: Path) -> _Header:
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        take = _taker(path, stream, size)
+        (format_id,) = take("<h")
+        if format_id not in (WITH_TIME, WITHOUT_TIME, UNCOMPRESSED, WIDE_NAMES):
+            raise DfsmError(
+                f"{path} is no binary OpenFAST output: its format id is {format_id}, expected 1, "
+                "2, 3 or 4; check that it is the right file and was copied in binary mode"
+            )
+        width = take("<h")[0] if format_id == WIDE_NAMES else DEFAULT_NAME_WIDTH
+        count, samples = take("<ii")
+        _check_range(path, "name width", width, 1, MAX_NAME_WIDTH)
+        _check_range(path, "number of channels", count, 1)
+        _check_range(path, "number of samples", samples, 2)
+        _check_time_fields(path, format_id, *take("<dd"))
+        scales = None
+        if format_id != UNCOMPRESSED:
+            scales = take(f"<{count}f")
+            take(f"<{count}f")
+        (description,) = take("<i")
+        _check_range(path, "description length", description, 0)
+        take(f"<{description}s")
+        names = _texts(take(f"<{(count + 1) * width}s")[0], width)
+        units = _texts(take(f"<{(count + 1) * width}s")[0], width)
+        row = count * (8 if format_id == UNCOMPRESSED else 2) + 4 * (format_id == WITH_TIME)
+        expected = stream.tell() + samples * row
+    if size != expected:
+        what = "truncated" if size < expected else "longer than it should be"
+        raise DfsmError(
+            f"{path} is {what}: its header announces {count} channels and {samples} samples, which "
+            f"makes {expected} bytes, but it has {size}; copy it again or rerun the simulation"
+        )
+    return _Header(names[1:], tuple(map(_unit, units[1:])), scales)
+
+
+def _taker(path: Path, stream: BinaryIO, size: int) -> Callable[[str], tuple]:
+    def take(layout: str) -> tuple:
+        wanted = struct.calcsize(layout)
+        # Asked before reading, so that a corrupted count never allocates memory.
+        data = stream.read(wanted) if stream.tell() + wanted <= size else b""
+        if len(data) != wanted:
+            raise DfsmError(
+                f"{path} is truncated or no binary OpenFAST output: its {size} bytes end inside "
+                "the header; copy it again or rerun the simulation"
+            )
+        return struct.unpack(layout, data)
+
+    return take
+
+
+def _check_range(path: Path, what: str, value: int, low: int, high: int | None = None) -> None:
+    if value < low or (high is not None and value > high):
+        expected = f"at least {low}" if high is None else f"{low} to {high}"
+        raise DfsmError(
+            f"{path} is corrupted or no binary OpenFAST output: its header gives a {what} of "
+            f"{value}, expected {expected}; copy it again or rerun the simulation"
+        )
+
+
+def _check_time_fields(path: Path, format_id: int, first: float, second: float) -> None:
+    if format_id == WITH_TIME:
+        good = math.isfinite(first) and first != 0 and math.isfinite(second)
+        what = f"time scale {first:g} and offset {second:g}"
+    else:
+        good = math.isfinite(first) and math.isfinite(second) and second > 0
+        what = f"start time {first:g} s and time step {second:g} s"
+    if not good:
+        raise DfsmError(
+            f"{path} is corrupted or no binary OpenFAST output: its header gives a {what}, which "
+            "makes no increasing time; copy it again or rerun the simulation"
+        )
+
+
+def _texts(raw: bytes, width: int) -> tuple[str, ...]:
+    # One byte is one character there; Latin-1 is what the format's other readers take it for.
+    text = raw.decode("latin-1")
+    return tuple(text[i : i + width].strip(" \t\0") for i in range(0, len(text), width))
+
+
+def _unit(text: str) -> str:
+    # A unit wider than its field has lost its closing bracket.
+    return text[1:].rstrip(")]").strip() if text[:1] in ("(", "[") else text
+
+
+# -- text ---------------------------------------------------------------------------------------
+
+
+def _read_text(path: Path) -> Trajectory:
+    line, names, units = _text_header(path)
+    skip = line + (units is not None)
+    load = _library("load_ascii_output")
+    try:
+        data, _ = load(
+            str(path),
+            headerLines=skip,
+            descriptionLine=0,
+            attributeLine=line - 1,
+            unitLine=skip - 1,
+        )
+        good = data.ndim == 2 and data.shape[1] == len(names)
+    except (ValueError, IndexError, OSError):
+        good = False
+        data = np.empty((0, 0))
+    if not good:
+        raise _bad_row(path, skip, len(names))
+    units = units or [""] * len(names)
+    channels = [Channel(n, _unit(u)) for n, u in zip(names[1:], units[1:], strict=True)]
+    return assemble(path, data[:, 0], data[:, 1:], channels)
+
+
+def _text_header(path: Path) -> tuple[int, list[str], list[str] | None]:
+    """Find the line (from 1) with the names, the names, and the units of the next line if any."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        # Drivers write headers of other lengths than OpenFAST, so the line is looked for. The
+        # length limit keeps a foreign file without line ends out of memory.
+        lines = [stream.readline(1_000_000) for _ in range(HEADER_LINES + 1)]
+    for number, text in enumerate(lines[:-1], start=1):
+        names = text.split()
+        if len(names) < 2 or names[0].lower() != "time":
+            continue
+        units = lines[number].split()
+        if units and _is_number(units[0]):
+            return number, names, None
+        if len(units) == len(names):
+            return number, names, units
+        # A title may begin with the word as well, but is not followed by units.
+        if units and units[0].startswith("("):
+            raise DfsmError(
+                f"{path}, line {number + 1}: {len(units)} units for the {len(names)} names in line "
+                f"{number}, one unit per name was expected: the file is cut off or foreign"
+            )
+    raise DfsmError(
+        f"{path} is no OpenFAST output: no line that starts with 'Time' among its first "
+        f"{HEADER_LINES} lines; check that it is the right file"
+    )
+
+
+def _bad_row(path: Path, skip: int, columns: int) -> DfsmError:
+    """Say which line of a text file could not be read."""
+    try:
+        with path.open() as stream:
+            number = 0
+            for number, line in enumerate(stream, start=1):
+                if number <= skip:
+                    continue
+                fields = line.split()
+                if len(fields) != columns:
+                    return DfsmError(
+                        f"{path}, line {number}: {len(fields)} values, but the header names "
+                        f"{columns} channels: the run was cut off there or a value has filled its "
+                        "column; remove the line or rerun with a wider OutFmt"
+                    )
+                for column, text in enumerate(fields, start=1):
+                    if not _is_number(text):
+                        return DfsmError(
+                            f"{path}, line {number}: {text[:24]!r} in column {column} is no "
+                            "number: correct it, or rerun with a wider OutFmt"
+                        )
+    except UnicodeDecodeError:
+        return DfsmError(f"{path} is neither text nor binary OpenFAST output: check the file")
+    return DfsmError(f"{path}: no samples after its header, which ends in line {min(number, skip)}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _library(function: str) -> Callable[..., tuple]:
+    try:
+        from openfast_io import FAST_output_reader
+    except ImportError:
+        raise DfsmError(
+            "reading OpenFAST files needs openfast-io, which is not installed: "
+            "pip install 'dfsm[openfast]'"
+        ) from None
+    return getattr(FAST_output_reader, function)

@@ -1,0 +1,247 @@
+"""Parquet: runs with everything a `Channel` knows, plain or packed as 16-bit codes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dfsm.core.files import write_file
+from dfsm.core.types import Array
+from dfsm.data.readers.assemble import assemble
+from dfsm.data.readers.columns import SECONDS, kept_columns, split_header, time_column
+from dfsm.data.trajectory import Channel, Role, Trajectory
+from dfsm.errors import DfsmError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+CODE_MIN, CODE_MAX = -32768, 32767
+# How far, in steps, a sample may lie off the grid: rounding in float64 stays far below.
+GRID_SLACK = 1e-3
+# The codes' place in the 16-bit range is found by trial where they leave room.
+MAX_SHIFTS = 64
+
+
+def read_parquet(path: Path) -> Trajectory:
+    """Read a run from an existing Parquet file, see `dfsm.data.readers.tables.read_table`.
+
+    Raises
+    ------
+    DfsmError
+        Damaged, without time, a column that is not numeric, or metadata that make no sense.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            table = file.read()
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0][:160]
+        raise DfsmError(
+            f"{path} is no readable Parquet file ({reason}): it is damaged or of another kind; "
+            "write it again"
+        ) from error
+    schema = _texts(table.schema.metadata)
+    units = _pandas_units(schema)
+    channels = [_channel(path, table.schema.field(i), units) for i in range(table.num_columns)]
+    columns = [_column(path, table, i) for i in range(table.num_columns)]
+    if "dfsm.time_start" in schema:
+        at, start = None, _number(path, schema, "dfsm.time_start")
+        time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
+    else:
+        at = _time_index(path, table.schema, channels, schema)
+        time = columns[at]
+    keep, notes = kept_columns(path, channels, columns, at)
+    if not keep:
+        raise DfsmError(f"{path}: no channel besides time, at least one is needed")
+    return assemble(
+        path,
+        time,
+        np.stack([columns[i] for i in keep], axis=1),
+        [channels[i] for i in keep],
+        name=schema.get("dfsm.name"),
+        wall_time=_number(path, schema, "dfsm.wall_time") if "dfsm.wall_time" in schema else None,
+        notes=(*_notes(path, schema), *notes),
+    )
+
+
+def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
+    """Write a run to Parquet, see `dfsm.write_table`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = {"dfsm.name": trajectory.name, "dfsm.notes": json.dumps(trajectory.notes)}
+    if trajectory.source:
+        # The file's name says where the data came from; the folder is nobody else's business.
+        schema["dfsm.source"] = Path(trajectory.source).name
+    if trajectory.wall_time is not None:
+        schema["dfsm.wall_time"] = repr(trajectory.wall_time)
+    fields, arrays, coded = [], [], {}
+    mesh = _equidistant(trajectory) if packed else None
+    if mesh is None:
+        fields.append(pa.field("Time", pa.float64(), metadata={"unit": "s"}))
+        arrays.append(pa.array(trajectory.time))
+    else:
+        schema["dfsm.time_start"], schema["dfsm.time_step"] = map(repr, mesh)
+    for channel, values in zip(trajectory.channels, trajectory.values.T, strict=True):
+        known = {"unit": channel.unit}
+        if channel.step is not None:
+            known["step"] = repr(float(channel.step))
+        if channel.role is not None:
+            known["role"] = channel.role
+        codes = _pack(values, channel.step) if packed and channel.step else None
+        if codes is None:
+            arrays.append(pa.array(np.ascontiguousarray(values)))
+        else:
+            numbers, scale, offset = codes
+            known |= {"scale": repr(scale), "offset": repr(offset)}
+            arrays.append(pa.array(numbers, type=pa.int32()))
+            coded[channel.name] = "DELTA_BINARY_PACKED"
+        fields.append(pa.field(channel.name, arrays[-1].type, metadata=known))
+    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=schema))
+    options: dict[str, Any] = {"compression": "zstd", "compression_level": 19 if packed else 3}
+    if coded:
+        options |= {"use_dictionary": False, "column_encoding": coded}
+    with write_file(path) as temporary:
+        pq.write_table(table, temporary, **options)
+
+
+# -- packing ------------------------------------------------------------------------------------
+
+
+def _pack(values: Array, step: float) -> tuple[NDArray[np.int32], float, float] | None:
+    """Codes, scale and offset with value = (code - offset) / scale, or None off the grid."""
+    # A step beyond single precision is nobody's quantisation.
+    if not np.isfinite(values).all() or not 1e-30 < step < 1e30:
+        return None
+    low = float(values.min())
+    grid = np.rint((values - low) / step)
+    span = int(grid.max())
+    if span > CODE_MAX - CODE_MIN or np.abs(values - low - grid * step).max() > GRID_SLACK * step:
+        return None
+    # OpenFAST holds scale and offset in single precision and fills the range from its bottom.
+    # Where that is how the values came about, they are found again to the last bit.
+    scale = float(np.float32(1 / step))
+    for first in range(CODE_MIN, min(CODE_MIN + MAX_SHIFTS, CODE_MAX - span + 1)):
+        codes = grid + first
+        offset = float(np.float32(np.median(codes - values * scale)))
+        if np.array_equal((codes - offset) / scale, values):
+            return codes.astype(np.int32), scale, offset
+    codes = grid + CODE_MIN
+    return codes.astype(np.int32), 1 / step, CODE_MIN - low / step
+
+
+def _equidistant(trajectory: Trajectory) -> tuple[float, float] | None:
+    """Start and step that give the time mesh again to rounding, or None."""
+    if trajectory.time_step is None:
+        return None
+    time, mean = trajectory.time, trajectory.time_step
+    index = np.arange(len(time))
+    slack = 4 * np.spacing(np.abs(time).max())
+    for step in (mean, float(f"{mean:.9g}"), float(time[1] - time[0])):
+        if np.array_equal(time[0] + step * index, time):
+            return float(time[0]), step
+    return (float(time[0]), mean) if np.abs(time[0] + mean * index - time).max() <= slack else None
+
+
+# -- metadata -----------------------------------------------------------------------------------
+
+
+def _channel(path: Path, field: pa.Field, units: Mapping[str, str]) -> Channel:
+    known = _texts(field.metadata)
+    if "unit" in known:
+        name, unit = field.name, known["unit"]
+    elif field.name in units:
+        name, unit = field.name, units[field.name]
+    else:
+        name, unit = split_header(field.name)
+    role: Role | None = None
+    if "role" in known:
+        roles = {r: r for r in get_args(Role)}
+        if known["role"] not in roles:
+            raise DfsmError(
+                f"{path}: channel '{name}' has the role '{known['role']}', expected one of "
+                f"{', '.join(roles)}: write the file again"
+            )
+        role = roles[known["role"]]
+    step = _number(path, known, "step") if "step" in known else None
+    return Channel(name, unit, step, role)
+
+
+def _column(path: Path, table: pa.Table, index: int) -> Array:
+    import pyarrow as pa
+
+    field = table.schema.field(index)
+    kind = field.type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+        raise DfsmError(
+            f"{path}: column '{field.name}' holds {kind}, expected numbers: leave it out"
+        )
+    values = table.column(index).cast(pa.float64(), safe=False).to_numpy()
+    known = _texts(field.metadata)
+    if "scale" not in known:
+        return values
+    scale = _number(path, known, "scale")
+    if scale == 0:
+        raise DfsmError(f"{path}: column '{field.name}' has a scale of 0: write the file again")
+    return (values - _number(path, known, "offset")) / scale
+
+
+def _time_index(
+    path: Path, schema: pa.Schema, channels: list[Channel], metadata: Mapping[str, str]
+) -> int:
+    """Column that holds the time: by its name, or the float index of a pandas table."""
+    import pyarrow as pa
+
+    try:
+        return time_column(path, channels)
+    except DfsmError:
+        try:
+            index = json.loads(metadata.get("pandas", "{}")).get("index_columns", [])
+        except (ValueError, AttributeError):
+            raise DfsmError(f"{path}: its pandas metadata are damaged; write it again") from None
+        if len(index) == 1 and isinstance(index[0], str) and index[0] in schema.names:
+            at = schema.names.index(index[0])
+            if pa.types.is_floating(schema.field(at).type) and channels[at].unit in SECONDS:
+                return at
+        raise
+
+
+def _pandas_units(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Units of a frame that came from `Trajectory.to_pandas`, which pandas keeps as JSON."""
+    try:
+        units = json.loads(metadata.get("PANDAS_ATTRS", "{}")).get("units", {})
+        return {str(k): str(v) for k, v in units.items()}
+    except (ValueError, AttributeError):
+        return {}
+
+
+def _texts(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
+    known = metadata or {}
+    return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in known.items()}
+
+
+def _notes(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...]:
+    try:
+        return tuple(str(n) for n in json.loads(metadata.get("dfsm.notes", "[]")))
+    except (ValueError, TypeError):
+        raise DfsmError(f"{path}: its notes are damaged; write it again") from None
+
+
+def _number(path: Path, metadata: Mapping[str, str], key: str) -> float:
+    try:
+        number = float(metadata[key])
+    except (KeyError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise DfsmError(
+            f"{path}: its metadata give '{key}' as '{metadata.get(key)}', expected a number: "
+            "write the file again"
+        )
+    return number

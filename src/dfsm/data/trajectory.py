@@ -1,0 +1,379 @@
+"""Trajectory: named channels with units on one time mesh.
+
+Everything that enters the package becomes a `Trajectory` and everything that leaves it is one.
+Arrays are ``(time, channel)``; stacked over runs they are ``(sample, channel)``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError, missing, printable
+from dfsm.numerics.time_mesh import time_step
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Role = Literal["state", "control", "disturbance", "output", "parameter"]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What is known about one signal.
+
+    Attributes
+    ----------
+    name
+        Name as in the file.
+    unit
+        Unit as in the file, without brackets; never guessed.
+    step
+        Quantisation step in `unit`, where the file states it (16-bit `.outb`), else None. A
+        rounding error is uniform over one step, so its variance is ``step**2 / 12``.
+    role
+        What the signal is to a model, once that has been chosen.
+    computed
+        Whether it follows from other channels of the run, up to a processor's rounding.
+    """
+
+    name: str
+    unit: str = ""
+    step: float | None = None
+    role: Role | None = None
+    computed: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name and unit as an axis label shows them."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+def labels(channels: Sequence[Channel], most: int = 8) -> str:
+    """Names and units of the first channels, for one line of text."""
+    shown = ", ".join(printable(c.label) for c in channels[:most])
+    return f"{shown}, …" if len(channels) > most else shown or "none"
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One simulation: channels sampled on one strictly increasing time mesh.
+
+    Attributes
+    ----------
+    time
+        Time mesh in s, shape ``(time,)``; it need not be equidistant.
+    values
+        Samples, shape ``(time, channel)``, in the channels' units.
+    channels
+        One `Channel` per column.
+    name
+        Short name of the run, for tables and reports.
+    source
+        The file it was read from, if any.
+    wall_time
+        Seconds the simulator took to produce the span held here, if known.
+    notes
+        What a reader had to leave out or change, one sentence each.
+
+    Raises
+    ------
+    DfsmError
+        Shapes that disagree, duplicated channel names, or a time mesh that does not increase.
+    """
+
+    time: Array
+    values: Array
+    channels: tuple[Channel, ...]
+    name: str = "run"
+    source: str | None = None
+    wall_time: float | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        time = np.array(self.time, dtype=np.float64)
+        values = np.array(self.values, dtype=np.float64)
+        if time.ndim != 1 or values.shape != (len(time), len(self.channels)):
+            raise DfsmError(
+                f"{self.where}: time {time.shape} and values {values.shape} do not fit "
+                f"{len(self.channels)} channels; expected (time,) and (time, channel)"
+            )
+        if len(time) < 2:
+            raise DfsmError(f"{self.where}: {len(time)} samples, at least 2 are needed")
+        _check_time(time, self.where)
+        counts: dict[str, int] = {}
+        for c in self.channels:
+            counts[c.name] = counts.get(c.name, 0) + 1
+        twice = [name for name, n in counts.items() if n > 1]
+        if twice:
+            raise DfsmError(f"{self.where}: channel '{twice[0]}' stands there twice: rename one")
+        time.flags.writeable = False
+        values.flags.writeable = False
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "channels", tuple(self.channels))
+
+    # -- access ---------------------------------------------------------------------------------
+
+    @property
+    def where(self) -> str:
+        """The file, or else the name: how messages refer to this run."""
+        return self.source or self.name
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channel names in column order."""
+        return tuple(c.name for c in self.channels)
+
+    @property
+    def duration(self) -> float:
+        """Last time minus first time, in s."""
+        return float(self.time[-1] - self.time[0])
+
+    @cached_property
+    def time_step(self) -> float | None:
+        """Sampling interval in s if the mesh is equidistant (to 1e-6 of a step), else None."""
+        return time_step(self.time)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __repr__(self) -> str:
+        every = "irregular" if self.time_step is None else f"every {self.time_step:g} s"
+        return (
+            f"<Trajectory {printable(self.name)}: {len(self)} samples, {self.time[0]:g} to "
+            f"{self.time[-1]:g} s, {every}; {len(self.channels)} channels: {labels(self.channels)}>"
+        )
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._columns
+
+    def __getitem__(self, name: str) -> Array:
+        """Return the samples of one channel, shape ``(time,)``."""
+        return self.values[:, self.column(name)]
+
+    def column(self, name: str) -> int:
+        """Column of a channel.
+
+        Raises
+        ------
+        DfsmError
+            No such channel; the message names the file and suggests near names.
+        """
+        return self.columns([name])[0]
+
+    def columns(self, names: Iterable[str]) -> list[int]:
+        """Columns of several channels.
+
+        Raises
+        ------
+        DfsmError
+            Names all channels that are missing, as `column` does one.
+        """
+        names = list(names)
+        if lost := [n for n in dict.fromkeys(names) if n not in self._columns]:
+            raise DfsmError(f"{self.where}: {missing(lost, self.names)}")
+        return [self._columns[n] for n in names]
+
+    def channel(self, name: str) -> Channel:
+        """Return the description of one channel."""
+        return self.channels[self.column(name)]
+
+    @cached_property
+    def _columns(self) -> Mapping[str, int]:
+        return {c.name: i for i, c in enumerate(self.channels)}
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of time, values, names and units: what the run holds, not where it lay.
+
+        Of what was recorded, if anything was: computed channels differ in the last digits from one
+        processor to the next, and runs must have the same order on all.
+        """
+        recorded = [i for i, c in enumerate(self.channels) if not c.computed]
+        columns = recorded or list(range(len(self.channels)))
+        h = hashlib.sha256()
+        h.update(np.ascontiguousarray(self.time).tobytes())
+        h.update(np.ascontiguousarray(self.values[:, columns]).tobytes())
+        names = (f"{self.channels[i].name}\0{self.channels[i].unit}" for i in columns)
+        h.update("\0".join(names).encode())
+        return h.hexdigest()
+
+    # -- new trajectories from old --------------------------------------------------------------
+
+    def select(self, names: Iterable[str]) -> Trajectory:
+        """Keep the named channels, in the order given."""
+        columns = self.columns(names)
+        return replace(
+            self,
+            values=self.values[:, columns],
+            channels=tuple(self.channels[i] for i in columns),
+        )
+
+    def window(self, start: float | None = None, stop: float | None = None) -> Trajectory:
+        """Keep ``start <= time <= stop``; the recorded wall time shrinks in proportion.
+
+        Parameters
+        ----------
+        start, stop
+            Times in s; None leaves that end open.
+
+        Raises
+        ------
+        DfsmError
+            Fewer than two samples remain.
+        """
+        slack = 1e-9 * self.duration
+        lo = -np.inf if start is None else start - slack
+        hi = np.inf if stop is None else stop + slack
+        if start is not None and stop is not None and start >= stop:
+            raise DfsmError(f"the time window goes from {start:g} s to {stop:g} s: swap the two")
+        keep = (self.time >= lo) & (self.time <= hi)
+        if keep.sum() < 2:
+            raise DfsmError(
+                f"{self.where}: runs from {self.time[0]:g} s to {self.time[-1]:g} s, shorter than "
+                f"the time window asked for ({start if start is not None else '…'} to "
+                f"{stop if stop is not None else '…'} s): change the window or leave the run out"
+            )
+        time = self.time[keep]
+        part = float(time[-1] - time[0]) / self.duration
+        return replace(
+            self,
+            time=time,
+            values=self.values[keep],
+            wall_time=None if self.wall_time is None else self.wall_time * part,
+        )
+
+    def with_channels(self, channels: Sequence[Channel], values: ArrayLike) -> Trajectory:
+        """Append channels; `values` has shape ``(time, len(channels))``."""
+        values = np.asarray(values, dtype=np.float64).reshape(len(self), len(channels))
+        return replace(
+            self,
+            values=np.concatenate([self.values, values], axis=1),
+            channels=(*self.channels, *channels),
+        )
+
+    def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
+        """Set the roles of the named channels; the others keep theirs."""
+        self.columns(roles)
+        return replace(
+            self, channels=tuple(replace(c, role=roles.get(c.name, c.role)) for c in self.channels)
+        )
+
+    def require_finite(self) -> Trajectory:
+        """Return self, or fail on the first NaN or Inf.
+
+        Raises
+        ------
+        DfsmError
+            Names the channel, the count and the first time.
+        """
+        bad = ~np.isfinite(self.values)
+        if bad.any():
+            column = int(np.flatnonzero(bad.any(axis=0))[0])
+            rows = np.flatnonzero(bad[:, column])
+            raise DfsmError(
+                f"{self.where}: channel '{self.names[column]}' has {len(rows)} NaN or infinite "
+                f"samples, the first at {self.time[rows[0]]:g} s: leave the channel or that part "
+                "of the run out"
+            )
+        return self
+
+    def resample(self, time: ArrayLike) -> Trajectory:
+        """Interpolate linearly onto another mesh inside this one's span.
+
+        Raises
+        ------
+        DfsmError
+            The mesh reaches outside this run's span, or does not increase.
+        """
+        time = np.asarray(time, dtype=np.float64)
+        slack = 1e-9 * self.duration
+        if time.size and not (
+            time.min() >= self.time[0] - slack and time.max() <= self.time[-1] + slack
+        ):
+            raise DfsmError(
+                f"{self.where}: runs from {self.time[0]:g} s to {self.time[-1]:g} s, but samples "
+                f"from {time.min():g} s to {time.max():g} s were asked for: stay inside the run"
+            )
+        values = np.stack([np.interp(time, self.time, v) for v in self.values.T], axis=1)
+        return replace(self, time=time, values=values)
+
+    # -- pandas ---------------------------------------------------------------------------------
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table indexed by time; units are in ``frame.attrs['units']``."""
+        import pandas as pd
+
+        frame = pd.DataFrame(
+            self.values, index=pd.Index(self.time, name="Time"), columns=list(self.names)
+        )
+        frame.attrs["units"] = {c.name: c.unit for c in self.channels}
+        return frame
+
+    @classmethod
+    def from_pandas(
+        cls,
+        frame: pd.DataFrame,
+        units: Mapping[str, str] | None = None,
+        *,
+        name: str = "run",
+        source: str | None = None,
+    ) -> Trajectory:
+        """Build a trajectory from a table indexed by time in s.
+
+        Parameters
+        ----------
+        frame
+            One column per channel; the index is time.
+        units
+            Unit per column; default ``frame.attrs['units']``, and no unit where neither says.
+        name, source
+            See `Trajectory`.
+
+        Raises
+        ------
+        DfsmError
+            There is no column, or a column or the index is not numeric.
+        """
+        known: Mapping[str, str] = frame.attrs.get("units", {}) if units is None else units
+        where = source or name
+        columns = []
+        if not len(frame.columns):
+            raise DfsmError(
+                f"{where}: the table has no column besides its index, expected channels"
+            )
+        # By position: a name that stands twice is told by the constructor below.
+        for i, column in enumerate(frame.columns):
+            try:
+                columns.append(frame.iloc[:, i].to_numpy(dtype=np.float64))
+            except (TypeError, ValueError) as error:
+                raise DfsmError(f"{where}: column '{column}' is not numeric ({error})") from None
+        try:
+            time = frame.index.to_numpy(dtype=np.float64)
+        except (TypeError, ValueError):
+            raise DfsmError(f"{where}: the index is not time in s; set it to the time") from None
+        channels = tuple(Channel(str(c), known.get(str(c), "")) for c in frame.columns)
+        return cls(time, np.stack(columns, axis=1), channels, name=name, source=source)
+
+
+def _check_time(time: Array, where: str) -> None:
+    if not np.isfinite(time).all():
+        row = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise DfsmError(f"{where}: time is not a finite number in sample {row}")
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        row = int(np.flatnonzero(steps <= 0)[0]) + 1
+        what = "repeats" if math.isclose(time[row], time[row - 1]) else "goes back"
+        raise DfsmError(
+            f"{where}: time {what} at sample {row} ({time[row - 1]:g} s, then {time[row]:g} s); "
+            "a strictly increasing time is needed: sort the file or drop the repeated samples"
+        )

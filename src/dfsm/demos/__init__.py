@@ -1,0 +1,1 @@
+"""Studies that dfsm demo repeats."""

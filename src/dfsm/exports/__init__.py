@@ -1,0 +1,1 @@
+"""What is optimal or learnt, in the files of other programs."""

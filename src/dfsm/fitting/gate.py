@@ -1,0 +1,153 @@
+"""Which rows are corrected, by what, and whether that does good (Sec. 3.5, 3.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.data.derivatives import kinematic_rows
+from dfsm.fitting.corrective import NoCorrection, fit_corrective
+from dfsm.fitting.linear import LinearFit
+from dfsm.fitting.samples import Samples
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.corrective import Corrective, ignoring
+from dfsm.models.linear import LinearModel
+
+# A correction is kept if it explains at least this share of the residual's variance on runs left
+# out of training. Less than that is within what cross-validation finds in noise, and may undo what
+# a stable linear fit has gained.
+_WORTHWHILE = 0.01
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A corrective function and why it is there, or not.
+
+    Attributes
+    ----------
+    function
+        None where no row is corrected.
+    rows
+        Targets that it adds to.
+    decisions
+        For every target its figures and the decision in words; JSON values.
+    """
+
+    function: Corrective | None
+    rows: tuple[int, ...]
+    decisions: list[dict[str, Any]]
+
+    def withdrawn(self, reason: str) -> Correction:
+        """No correction after all, with the reason in the decisions."""
+        decisions = [
+            d | {"corrected": False, "decision": f"linear fit: {reason}"} if d["corrected"] else d
+            for d in self.decisions
+        ]
+        return Correction(None, (), decisions)
+
+
+def correct(
+    samples: Samples,
+    inputs: Array,
+    targets: Array,
+    linear: LinearFit,
+    settings: FitSettings,
+    later: bool = False,
+) -> Correction:
+    """Train a corrective function for the rows whose residual is large, and say which and why.
+
+    Parameters
+    ----------
+    samples
+        All training samples.
+    inputs, targets
+        What is fitted on what, shapes ``(sample, input)`` and ``(sample, target)``.
+    linear
+        The linear fit of the targets.
+    settings
+        Settings.
+    later
+        Train nothing: refinement is going to add a network.
+
+    Returns
+    -------
+    Correction
+    """
+    residuals = targets - _predict(linear.model, samples, inputs, targets)
+    rms, std = np.sqrt(np.mean(residuals**2, axis=0)), targets.std(axis=0)
+    ratio = rms / np.maximum(std, np.finfo(float).tiny)
+    derivatives = targets is samples.derivatives
+    known = kinematic_rows(settings.states) if derivatives else {}
+    large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > settings.gate]
+    function, explained, detail = None, dict[int, float](), ""
+    if large and not later and not isinstance(settings.corrective, NoCorrection):
+        hidden, seen = list(linear.model.known_inputs), inputs
+        if hidden:
+            seen = inputs.copy()
+            seen[:, hidden] = inputs[:, hidden].mean(axis=0)
+        trained = fit_corrective(
+            seen, residuals[:, large], samples.runs, settings.corrective, settings.seed
+        )
+        explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
+        # A correction that does no good on runs left out of training would only do harm.
+        kept = [k for k, share in enumerate(trained.explained) if share > _WORTHWHILE]
+        function = ignoring(trained.function.select(kept), hidden) if kept else None
+        large = [large[k] for k in kept]
+    else:
+        large = []
+    decisions = []
+    for i, (name, unit) in enumerate(_target_names(samples, derivatives)):
+        if i in known:
+            text = "kinematic, its rate is a state"
+        elif ratio[i] <= settings.gate:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal (gate {settings.gate:.1%})"
+        elif i in large:
+            text = (
+                f"corrected, residual {ratio[i]:.1%} of the signal, of whose variance "
+                f"{explained[i]:.1%} is explained in cross-validation ({detail})"
+            )
+        elif i in explained:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal: a correction explains "
+            if explained[i] < 0.001:  # negative where it would do harm
+                text += "nothing on data left out of its training"
+            else:
+                text += f"only {explained[i]:.1%} of its variance in cross-validation"
+        else:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal, "
+            text += "rollouts teach a network the rest" if later else "corrections switched off"
+        decisions.append(
+            {
+                "name": name,
+                "unit": unit,
+                "std": float(std[i]),
+                "residual_rms": float(rms[i]),
+                "explained": float(explained[i]) if i in explained else None,
+                "corrected": i in large,
+                "decision": text,
+            }
+        )
+    return Correction(function, tuple(large), decisions)
+
+
+def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """Evaluate the linear fit run by run, so that memory stays bounded."""
+    parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
+    return np.concatenate([np.asarray(p) for p in parts])
+
+
+@eqx.filter_jit
+def _apply(model: Any, inputs: Array) -> jax.Array:
+    return jax.vmap(model)(jnp.asarray(inputs))
+
+
+def _target_names(samples: Samples, derivatives: bool) -> Sequence[tuple[str, str]]:
+    if derivatives:
+        return samples.derivative_names
+    return [(c.name, c.unit) for c in samples.signals.outputs]

@@ -1,0 +1,176 @@
+"""From runs to training samples: choose the channels, take the derivatives (Sec. 3.2, 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from dfsm.core.progress import track
+from dfsm.core.types import Array, IntArray
+from dfsm.data.dataset import Dataset
+from dfsm.data.derivatives import (
+    differentiate,
+    state_names,
+    state_units,
+)
+from dfsm.data.info import gap_warning
+from dfsm.data.trajectory import Channel, Role, Trajectory
+from dfsm.data.wind import wind_warning
+from dfsm.errors import DfsmError
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.signals import (
+    Azimuth,
+    SignalTable,
+    blade_harmonics,
+    radians_per_second,
+    require_constant,
+    with_computed,
+)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """All training samples, stacked over runs (Sec. 3.2).
+
+    Attributes
+    ----------
+    inputs, derivatives, outputs, harmonics
+        I, Ẋ, Y and the blade-passing harmonics, shapes ``(sample, n)``.
+    runs
+        Run index of each sample, shape ``(sample,)``.
+    signals
+        What the columns mean.
+    derivative_names
+        Name and unit of each state derivative.
+    """
+
+    inputs: Array
+    derivatives: Array
+    outputs: Array
+    harmonics: Array
+    runs: IntArray
+    signals: SignalTable
+    derivative_names: tuple[tuple[str, str], ...]
+
+    def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
+        """Samples run by run."""
+        ends = np.flatnonzero(np.diff(self.runs, append=-1)) + 1
+        for start, stop in zip([0, *ends[:-1]], ends, strict=True):
+            yield inputs[start:stop], targets[start:stop]
+
+
+def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
+    """Keep the channels that the fit reads, check them, and put the runs in their order."""
+    roles = settings.roles
+    twice = [n for n in settings.outputs if n in state_names(settings.states)]
+    if twice:
+        raise DfsmError(f"'{twice[0]}' is a state, which models simulate: leave it out of outputs")
+    names = dict.fromkeys(roles)
+    if settings.azimuth is not None and settings.azimuth.angle is not None:
+        names[settings.azimuth.angle] = None
+    names.update(dict.fromkeys(f.source for f in settings.features))
+    runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
+    picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
+    for run in picked:
+        run.window(settings.start, settings.stop)
+    data = Dataset(picked)
+    for name in names:
+        data.channel(name)
+    for name in (*settings.controls, *settings.driving):
+        windows = [r.window(settings.start, settings.stop)[name] for r in data]
+        low, high = min(w.min() for w in windows), max(w.max() for w in windows)
+        if low == high:
+            raise DfsmError(
+                f"{roles[name]} '{name}' is {low:g} throughout all {len(data)} runs, so nothing "
+                f"can be learned about its effect: leave it out of {roles[name]}s, or add runs "
+                "in which it varies"
+            )
+    for run in data:
+        require_constant(run.window(settings.start, settings.stop), settings.parameters)
+    return data
+
+
+def data_warnings(data: Dataset, settings: FitSettings) -> list[str]:
+    """What a user should know about the data before trusting a fit, one sentence each."""
+    found = [text for name in settings.disturbances if (text := wind_warning(name))]
+    gaps = [
+        f"{run.where}: {text}"
+        for run in data
+        if (text := gap_warning(run.window(settings.start, settings.stop)))
+    ]
+    if gaps:
+        more = f" ({len(gaps)} of the {len(data)} runs have gaps)" if len(gaps) > 1 else ""
+        found.append(gaps[0] + more)
+    return found
+
+
+def extract(data: Dataset, settings: FitSettings) -> Samples:
+    """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
+    parts: list[list[Array]] = []
+    labels: tuple[tuple[str, str], ...] = ()
+    for run in track(data, "derivatives"):
+        found = differentiate(run, settings.states, settings.derivatives)
+        labels = tuple(zip(found.derivative_names, found.derivative_units, strict=True))
+        whole = found.trajectory
+        inside = whole.window(settings.start, settings.stop)
+        rows = np.isin(whole.time, inside.time)
+        names = (*settings.controls, *settings.driving, *found.names, *settings.parameters)
+        parts.append(
+            [
+                inside.select(names).values,
+                found.derivatives[rows],
+                run.select(settings.outputs).values[rows],
+                _harmonics(run, settings.azimuth)[rows],
+            ]
+        )
+    lengths = [len(p[0]) for p in parts]
+    inputs, derivatives, outputs, harmonics = (np.concatenate(c) for c in zip(*parts, strict=True))
+    return Samples(
+        inputs=inputs,
+        derivatives=derivatives,
+        outputs=outputs,
+        harmonics=harmonics,
+        runs=np.repeat(np.arange(len(data)), lengths),
+        signals=_signals(data, settings),
+        derivative_names=labels,
+    )
+
+
+def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
+    # The first run stands for all: `select` has made sure that units agree.
+    first, names = data[0], state_names(settings.states)
+
+    def channels(names: Iterable[str], role: Role) -> tuple[Channel, ...]:
+        return tuple(Channel(n, first.channel(n).unit, role=role) for n in names)
+
+    table = SignalTable(
+        states=tuple(
+            Channel(n, unit, role="state")
+            for n, unit in zip(names, state_units(settings.states, first), strict=True)
+        ),
+        controls=channels(settings.controls, "control"),
+        disturbances=channels(settings.driving, "disturbance"),
+        parameters=channels(settings.parameters, "parameter"),
+        outputs=channels(settings.outputs, "output"),
+        specs=tuple(settings.states),
+        derivatives=settings.derivatives,
+        azimuth=settings.azimuth,
+        hub_height=settings.hub_height,
+        features=settings.features,
+    )
+    _ = table.azimuth_rate  # fails here, not in the middle of a simulation
+    return table
+
+
+def _harmonics(run: Trajectory, azimuth: Azimuth | None) -> Array:
+    if azimuth is None:
+        return np.empty((len(run), 0))
+    if azimuth.angle is not None:
+        psi = np.deg2rad(run[azimuth.angle])
+    else:
+        omega = run[azimuth.speed] * radians_per_second(run.channel(azimuth.speed))
+        psi = cumulative_trapezoid(omega, run.time, initial=0.0)
+    return np.asarray(blade_harmonics(psi, azimuth.blades))

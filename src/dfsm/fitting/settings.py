@@ -1,0 +1,119 @@
+"""FitSettings: everything that defines a fit besides the data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import field
+
+from dfsm.core.settings import require, settings_class
+from dfsm.data.derivatives import (
+    DerivativeSettings,
+    StateSpec,
+)
+from dfsm.data.features import Feature
+from dfsm.data.trajectory import Role
+from dfsm.errors import DfsmError
+from dfsm.fitting.corrective import CorrectiveSettings
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.linear import LPV, LTI
+from dfsm.models.signals import (
+    Azimuth,
+)
+
+
+@settings_class
+class FitSettings:
+    """Everything that defines a fit besides the data.
+
+    Attributes
+    ----------
+    states
+        What is a state, and of which order, see `StateSpec`.
+    controls, disturbances, parameters, outputs
+        Channel names by role. Disturbances are known signals that nobody chooses; none of them
+        may hold a response of the system.
+    start, stop
+        Time window in s used for training; derivatives are taken on the whole run before.
+    derivatives
+        How derivatives are extracted.
+    linear
+        `LTI`, or `LPV` in one of the disturbances (or other inputs).
+    corrective
+        Kind and settings of the corrective functions; None leaves the linear fit alone.
+    gate
+        A row is corrected only where the RMS of its residual exceeds this share of the signal's
+        standard deviation.
+    azimuth
+        Blade-passing harmonics for the outputs.
+    hub_height
+        In m; adds the channel ``RtVAvgxhCorr``, the rotor wind without the platform's motion, to
+        runs that only have ``RtVAvgxh``.
+    features
+        Disturbances that are computed from others, see `Feature`; they follow those named.
+    nonlinear_only
+        Also fit f̂_NL, the same corrective function without a linear part, for comparison.
+    seed
+        Seed of everything random.
+    """
+
+    states: tuple[StateSpec, ...]
+    controls: tuple[str, ...] = ()
+    disturbances: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    start: float | None = None
+    stop: float | None = None
+    derivatives: DerivativeSettings = field(default_factory=DerivativeSettings)
+    linear: LTI | LPV = field(default_factory=LTI)
+    corrective: CorrectiveSettings = field(default_factory=MLP)
+    gate: float = 0.01
+    azimuth: Azimuth | None = None
+    hub_height: float | None = None
+    features: tuple[Feature, ...] = ()
+    nonlinear_only: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.gate >= 0, "gate", self.gate, "0 or more")
+        require(self.seed >= 0, "seed", self.seed, "0 or more")
+
+    @property
+    def driving(self) -> tuple[str, ...]:
+        """Names of all disturbances, the computed ones last."""
+        return (*self.disturbances, *(f.name for f in self.features))
+
+    @property
+    def roles(self) -> dict[str, Role]:
+        """Role of every channel that the fit reads.
+
+        Raises
+        ------
+        DfsmError
+            A channel is listed twice, or in two roles that exclude each other.
+        """
+        roles: dict[str, Role] = {}
+        groups: tuple[tuple[Role, Iterable[str]], ...] = (
+            ("state", [n for s in self.states for n in s.channels]),
+            ("control", self.controls),
+            ("disturbance", self.driving),
+            ("parameter", self.parameters),
+            ("output", self.outputs),
+        )
+        for role, names in groups:
+            for i, name in enumerate(names := list(names)):
+                if role != "state" and name in names[:i]:
+                    raise DfsmError(f"channel '{name}' is listed twice as {role}: name it once")
+                if roles.get(name, role) != role and "output" not in (role, roles[name]):
+                    raise DfsmError(
+                        f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
+                    )
+                roles.setdefault(name, role)
+        for feature in self.features:
+            role = roles.get(feature.source, "disturbance")
+            if role != "disturbance":
+                raise DfsmError(
+                    f"feature '{feature.name}' is made of the {role} '{feature.source}', but a "
+                    "rollout may know no responses and an optimizer must be free to choose "
+                    "controls: make features of disturbances only"
+                )
+        return roles

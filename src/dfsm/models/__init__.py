@@ -1,0 +1,1 @@
+"""What a surrogate is, and how it is evaluated."""

@@ -1,0 +1,368 @@
+"""DFSM: the surrogate ξ̇ = f̂(ξ, u, w, p) and y = ĝ(ξ, u, w, p) as one immutable JAX pytree.
+
+    f̂(I) = f̂_L(I; s) + e(I)        ĝ(I) = ĝ_L(I; s) + e_g(I)        I = [u, w, ξ, p]
+
+The linear parts are defined for every row; the corrective functions only for the rows that need
+one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `derivative` and
+`output`, so simulation, Jacobians and optimization see the same function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.types import Array, ComplexArray
+from dfsm.data.trajectory import labels
+from dfsm.errors import DfsmError, printable
+from dfsm.models.corrective import Corrective
+from dfsm.models.linear import LinearModel
+from dfsm.models.region import Region
+from dfsm.models.signals import Provenance, SignalTable, blade_harmonics
+from dfsm.numerics.hats import scheduled
+
+if TYPE_CHECKING:
+    import control
+
+
+# Samples evaluated at once.
+_BLOCK = 4096
+
+
+class DFSM(eqx.Module):
+    """A derivative function surrogate model.
+
+    Attributes
+    ----------
+    f, g
+        Linear fits of all state derivatives and of all outputs (None without outputs).
+    e, e_g
+        Corrective functions of the derivatives `corrected` and the outputs `corrected_outputs`.
+    region
+        Where the training data lie.
+    corrected, corrected_outputs
+        Row indices that the corrective functions add to.
+    signals
+        Names, units and roles.
+    provenance
+        Where the model comes from; see `Provenance`.
+    """
+
+    f: LinearModel
+    e: Corrective | None
+    g: LinearModel | None
+    e_g: Corrective | None
+    region: Region
+    corrected: tuple[int, ...] = eqx.field(static=True)
+    corrected_outputs: tuple[int, ...] = eqx.field(static=True)
+    signals: SignalTable = eqx.field(static=True)
+    provenance: Provenance = eqx.field(static=True, default_factory=Provenance)
+
+    def __repr__(self) -> str:
+        # Without the arrays, which JAX replaces by other things at times.
+        groups = ("states", "controls", "disturbances", "parameters", "outputs")
+        told = [f"{g} {labels(c)}" for g in groups if (c := getattr(self.signals, g))]
+        kind = "LTI" if self.f.schedule is None else f"LPV in {printable(self.schedule or '')}"
+        rows = f"{len(self.corrected)} of {len(self.signals.states)} derivatives"
+        if outputs := len(self.signals.outputs):
+            rows += f" and {len(self.corrected_outputs)} of {outputs} outputs"
+        return f"<DFSM: {kind}, {rows} corrected; {'; '.join(told)}>"
+
+    # -- evaluation -----------------------------------------------------------------------------
+
+    def derivative(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> jax.Array:
+        """Evaluate f̂.
+
+        Parameters
+        ----------
+        states, controls, disturbances, parameters
+            Shapes ``(..., n)`` in the order and units of `signals`; leading axes broadcast.
+
+        Returns
+        -------
+        Array
+            State derivatives per second, shape ``(..., state)``.
+        """
+        groups = self._groups(states, controls, disturbances, parameters)
+        return _evaluate(self, _derivative, _joined(groups), scheduled(self.f.schedule, groups))
+
+    def output(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+        azimuth: ArrayLike | None = None,
+    ) -> jax.Array:
+        """Evaluate ĝ.
+
+        Parameters
+        ----------
+        states, controls, disturbances, parameters
+            As for `derivative`.
+        azimuth
+            Rotor azimuth ψ in rad, shape ``(...)``, for a model with blade-passing harmonics;
+            None takes the average over a revolution.
+
+        Returns
+        -------
+        Array
+            Outputs, shape ``(..., output)``.
+        """
+        groups = self._groups(states, controls, disturbances, parameters)
+        inputs = _joined(groups)
+        if self.g is None:
+            return jnp.zeros((*inputs.shape[:-1], 0))
+        value = scheduled(self.g.schedule, groups)
+        if self.signals.azimuth is None:
+            return _evaluate(self, _output, inputs, value)
+        if azimuth is None:
+            harmonics = jnp.zeros((*inputs.shape[:-1], 2))
+        else:
+            harmonics = blade_harmonics(azimuth, self.signals.azimuth.blades)
+        shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
+        parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
+        return _evaluate(self, _output, jnp.concatenate(parts, axis=-1), value)
+
+    def join(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> jax.Array:
+        """Put the groups together as I = [u, w, ξ, p], shape ``(..., input)``.
+
+        Raises
+        ------
+        DfsmError
+            A group has the wrong number of elements.
+        """
+        return _joined(self._groups(states, controls, disturbances, parameters))
+
+    def _groups(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike,
+    ) -> list[jax.Array]:
+        """u, w, ξ and p as arrays; those with a wrong number of elements are refused."""
+        groups = []
+        for group, value in (
+            ("controls", controls),
+            ("disturbances", disturbances),
+            ("states", states),
+            ("parameters", parameters),
+        ):
+            array = jnp.asarray(value, dtype=jnp.float64)
+            names = self.signals.names(group)
+            if array.ndim == 0 or array.shape[-1] != len(names):
+                raise DfsmError(
+                    f"{group} have shape {array.shape}, expected the last axis to hold "
+                    f"{len(names)}: {', '.join(names) or 'none'}"
+                )
+            groups.append(array)
+        return groups
+
+    def split(self, inputs: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Take I apart: states, controls, disturbances, parameters."""
+        inputs = jnp.asarray(inputs)
+        s = self.signals
+        ends = np.cumsum([len(s.controls), len(s.disturbances), len(s.states), len(s.parameters)])
+        u, w, x, p = (inputs[..., a:b] for a, b in zip([0, *ends[:-1]], ends, strict=True))
+        return x, u, w, p
+
+    def prepared(self) -> DFSM:
+        """The same model with what does not depend on the inputs computed once, for use in loops.
+
+        It evaluates like the model itself, but cannot be saved.
+        """
+        e = None if self.e is None else self.e.prepared()
+        e_g = None if self.e_g is None else self.e_g.prepared()
+        return replace(self, e=e, e_g=e_g)  # pyright: ignore[reportArgumentType]
+
+    # -- derived models -------------------------------------------------------------------------
+
+    def linear_fit(self) -> DFSM:
+        """Return the model without its corrective functions: f̂_L and ĝ_L."""
+        return replace(self, e=None, e_g=None, corrected=(), corrected_outputs=())
+
+    def jacobians(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> tuple[Array, Array, Array, Array]:
+        """Exact Jacobians of f̂ and ĝ at one point, corrective functions included.
+
+        Returns
+        -------
+        tuple of ndarray
+            A ``(state, state)``, B ``(state, control + disturbance)``, C ``(output, state)``,
+            D ``(output, control + disturbance)``, in physical units; harmonics at their mean.
+        """
+        inputs = self.join(states, controls, disturbances, parameters)
+        if inputs.ndim != 1:
+            raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
+        xs = self.signals.state_columns
+        us = slice(0, xs.start)
+        J = np.asarray(_jacobian(self, _derivative, inputs))
+        extra = jnp.zeros(2 if self.signals.azimuth else 0)
+        G = (
+            np.asarray(_jacobian(self, _output, jnp.concatenate([inputs, extra])))
+            if self.g is not None
+            else np.empty((0, len(inputs)))
+        )
+        return J[:, xs], J[:, us], G[:, xs], G[:, us]
+
+    def linearize(
+        self,
+        states: ArrayLike,
+        controls: ArrayLike,
+        disturbances: ArrayLike,
+        parameters: ArrayLike = (),
+    ) -> control.StateSpace:
+        """Linearize at a point to a python-control state-space model with named signals.
+
+        Raises
+        ------
+        DfsmError
+            python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError:
+            raise DfsmError("linearize needs python-control: pip install 'dfsm[control]'") from None
+        A, B, C, D = self.jacobians(states, controls, disturbances, parameters)
+        names = self.signals.names
+        return control.StateSpace(
+            A,
+            B,
+            C,
+            D,
+            states=list(names("states")),
+            inputs=[*names("controls"), *names("disturbances")],
+            outputs=list(names("outputs")),
+        )
+
+    def eigenvalues(self) -> list[tuple[float, ComplexArray]]:
+        """Eigenvalues (1/s) of the linear fit's A at every schedule point.
+
+        Returns
+        -------
+        list
+            Pairs of schedule value and complex eigenvalues, most unstable first.
+        """
+        A = np.asarray(self.f.coefficients)[:, :, self.signals.state_columns]
+        pairs = []
+        for point, matrix in zip(np.asarray(self.f.grid), A, strict=True):
+            values = np.linalg.eigvals(matrix).astype(np.complex128)
+            pairs.append((float(point), values[np.argsort(-values.real)]))
+        return pairs
+
+    def summary(self) -> str:
+        """Describe the model: signals, which rows are corrected and why, stability, warnings."""
+        s, record = self.signals, self.provenance.record
+        lines = [
+            f"{group}: {', '.join(c.label for c in getattr(s, group))}"
+            for group in ("states", "controls", "disturbances", "parameters", "outputs")
+            if getattr(s, group)
+        ]
+        kind = f"LPV in {self.schedule}, {len(self.f.grid)} points" if self.schedule else "LTI"
+        lines.append(f"linear fit: {kind}, condition number {record.get('condition', np.nan):.3g}")
+        for row in record.get("rows", []):
+            lines.append(f"  {row['name']} ({row['unit']}): {row['decision']}")
+        for point, values in self.eigenvalues():
+            where = f" at {self.schedule} = {point:.4g}" if self.schedule else ""
+            listed = ", ".join(_complex(v) for v in values if v.imag >= 0)
+            unstable = "  UNSTABLE" if values.real.max() > 0 else ""
+            lines.append(f"  eigenvalues (1/s){where}: {listed}{unstable}")
+        lines += [f"check: {text}" for text in record.get("checks", [])]
+        if "refinement" in record:
+            lines.append(record["refinement"]["message"])
+        lines += [f"warning: {text}" for text in record.get("warnings", [])]
+        return "\n".join(lines)
+
+    @property
+    def schedule(self) -> str | None:
+        """Name of the scheduling input, None for an LTI model."""
+        column = self.f.schedule
+        return None if column is None else self.signals.inputs[column].name
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.3g}" + (f" ± {value.imag:.3g}i" if value.imag else "")
+
+
+def _joined(groups: Sequence[jax.Array]) -> jax.Array:
+    shape = jnp.broadcast_shapes(*(g.shape[:-1] for g in groups))
+    return jnp.concatenate([jnp.broadcast_to(g, (*shape, g.shape[-1])) for g in groups], axis=-1)
+
+
+def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
+    return _sum((model.f, model.e, model.corrected), inputs, value)
+
+
+def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
+    if model.g is None:
+        return jnp.zeros(0)
+    return _sum((model.g, model.e_g, model.corrected_outputs), inputs, value)
+
+
+def _sum(
+    parts: tuple[LinearModel, Corrective | None, tuple[int, ...]],
+    inputs: jax.Array,
+    value: jax.Array | None,
+) -> jax.Array:
+    """A linear fit, and its corrective function in some rows, at one input vector."""
+    linear, corrective, rows = parts
+    total = linear(inputs, value)
+    if corrective is None:
+        return total
+    # Written out per row: a scatter costs more than all the rest of a small model.
+    place = {row: k for k, row in enumerate(rows)}
+    extra = corrective(inputs)
+    return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(total)])
+
+
+Row = Callable[..., jax.Array]
+
+
+@eqx.filter_jit
+def _evaluate(model: DFSM, row: Row, inputs: jax.Array, value: jax.Array) -> jax.Array:
+    """Evaluate `_derivative` or `_output` at inputs ``(..., input)``.
+
+    `value` is the schedule's there, of a shape that broadcasts to ``(...)``.
+    """
+    model = model.prepared()
+    flat = inputs.reshape(-1, inputs.shape[-1])
+    values = jnp.broadcast_to(value, inputs.shape[:-1]).ravel()
+
+    def one(at: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return row(model, *at)
+
+    # Blocks keep the activations of hundreds of units in the cache instead of in memory.
+    many, given = flat.shape[0] > 2 * _BLOCK, (flat, values)
+    found = jax.lax.map(one, given, batch_size=_BLOCK) if many else jax.vmap(one)(given)
+    return found.reshape(*inputs.shape[:-1], found.shape[-1])
+
+
+@eqx.filter_jit
+def _jacobian(model: DFSM, row: Row, inputs: jax.Array) -> jax.Array:
+    return jax.jacfwd(lambda inputs: row(model, inputs))(inputs)

@@ -1,0 +1,291 @@
+"""Latent states: unmeasured states with stable linear dynamics of their own, driven by the inputs.
+
+    ζ̇ = λ ζ + b·v,      λ = -σ - iω,      v = [u, w]
+
+Each complex ζ is a damped pair of real states (Re ζ, Im ζ). They remember what the measured states
+cannot: an inflow that settles, waves that went by. Nothing measured drives them, so a recorded run
+tells their value at any time from its inputs alone, and they are stable whatever is learned.
+
+In a model they are the last states, with rows that do not depend on the schedule; everything that
+evaluates a model treats them like any other state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.types import Array, IntArray
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.models.corrective import Corrective, GaussianUnits
+from dfsm.models.dfsm import DFSM
+from dfsm.models.linear import LinearModel
+from dfsm.models.region import Region
+
+# Before the record begins, the inputs are taken to have been what they were on average over this.
+_REST = 20.0  # s
+# Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
+_PAD = 1000
+
+
+class Poles(NamedTuple):
+    """Dynamics of the latent pairs.
+
+    Attributes
+    ----------
+    decay, frequency
+        σ in 1/s and ω in rad/s, shape ``(pair,)``.
+    drive
+        b, complex, shape ``(pair, control + disturbance)``.
+    offset
+        What is added to b·v, complex, shape ``(pair,)``.
+    """
+
+    decay: jax.Array
+    frequency: jax.Array
+    drive: jax.Array
+    offset: jax.Array
+
+
+def poles(model: DFSM) -> Poles:
+    """Dynamics of a model's latent pairs."""
+    n_uw, even, odd = _rows(model)
+    L, b = model.f.coefficients[0], model.f.offsets[0]
+    return Poles(
+        -L[even, n_uw + even],
+        L[even, n_uw + odd],
+        L[even, :n_uw] + 1j * L[odd, :n_uw],
+        b[even] + 1j * b[odd],
+    )
+
+
+def with_poles(model: DFSM, found: Poles) -> DFSM:
+    """The model with other dynamics of its latent pairs; JAX can follow it."""
+    n_uw, even, odd = _rows(model)
+    L, b = model.f.coefficients, model.f.offsets
+    for rows, others, sign, part in ((even, odd, 1.0, jnp.real), (odd, even, -1.0, jnp.imag)):
+        L = L.at[:, rows, n_uw + rows].set(-found.decay)
+        L = L.at[:, rows, n_uw + others].set(sign * found.frequency)
+        L = L.at[:, rows, :n_uw].set(part(found.drive))
+        b = b.at[:, rows].set(part(found.offset))
+    return replace(model, f=replace(model.f, coefficients=L, offsets=b))
+
+
+def _rows(model: DFSM) -> tuple[int, IntArray, IntArray]:
+    """Number of inputs that drive the pairs, and the rows of their real and imaginary parts."""
+    s = model.signals
+    first, last = len(s.observed), len(s.states)
+    return len(s.driving), np.arange(first, last, 2), np.arange(first + 1, last, 2)
+
+
+@jax.jit
+def evolve(found: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Array:
+    """Follow the latent pairs along inputs that vary linearly within each step.
+
+    Parameters
+    ----------
+    found
+        The dynamics.
+    h
+        Steps in s ``(step,)``; a step of zero changes nothing.
+    v
+        Controls and disturbances at the ends of the steps, ``(step + 1, control + disturbance)``.
+    rest
+        The pairs start at rest under these, ``(control + disturbance,)``.
+
+    Returns
+    -------
+    Array
+        Complex, ``(step + 1, pair)``.
+    """
+    rate = -found.decay - 1j * found.frequency
+    x = h[:, None] * rate
+    # exp(x) and the weights of both ends to the order of RK4, which marches the other states.
+    growth = 1 + x * (1 + x / 2 * (1 + x / 3 * (1 + x / 4)))
+    end = h[:, None] * (1 / 2 + x / 6 + x**2 / 24)
+    begin = h[:, None] * (1 + x / 2 + x**2 / 6 + x**3 / 24) - end
+    force = v @ found.drive.T + found.offset
+    added = begin * force[:-1] + end * force[1:]
+    start = -(found.drive @ rest + found.offset) / rate
+
+    def step(z: jax.Array, terms: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        z = terms[0] * z + terms[1]
+        return z, z
+
+    _, path = jax.lax.scan(step, start, (growth, added))
+    return jnp.concatenate([start[None], path])
+
+
+def as_states(pairs: jax.Array) -> jax.Array:
+    """Real states ``(..., 2 pair)`` in a model's order from complex pairs ``(..., pair)``."""
+    both = jnp.stack([pairs.real, pairs.imag], axis=-1)
+    return both.reshape(*pairs.shape[:-1], -1)
+
+
+def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
+    """Input vectors ``(..., input)`` with the latent states that their own inputs lead to."""
+    s = model.signals
+    if not s.latents:
+        return inputs
+    found, first = poles(model), s.observed_columns.stop
+    force = inputs[..., : len(s.driving)] @ found.drive.T + found.offset
+    pairs = as_states(force / (found.decay + 1j * found.frequency))
+    return inputs.at[..., first : first + len(s.latents)].set(pairs)
+
+
+def latent_path(model: DFSM, run: Trajectory) -> Array:
+    """Latent states along the recorded inputs of a run.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    run
+        Holds its controls and disturbances, from as long before the time of interest as possible.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(time, latent)``.
+
+    Raises
+    ------
+    DfsmError
+        A channel is missing or not finite.
+    """
+    if not model.signals.latents:
+        return np.zeros((len(run), 0))
+    inputs = run.select(model.signals.driving).require_finite()
+    padded = -(-(len(run) - 1) // _PAD) * _PAD
+    h = np.zeros(padded)
+    h[: len(run) - 1] = np.diff(run.time)
+    v = np.concatenate([inputs.values, np.repeat(inputs.values[-1:], padded + 1 - len(run), 0)])
+    path = as_states(evolve(poles(model), h, v, rest(run.time, inputs.values)))
+    return np.asarray(path)[: len(run)]
+
+
+def latents_at(model: DFSM, run: Trajectory, time: Array) -> Array:
+    """Latent states at times in s within a run, ``(time, latent)``; see `latent_path`."""
+    time = np.clip(time, run.time[0], run.time[-1])
+    both = np.union1d(run.time, time)
+    path = latent_path(model, run.select(model.signals.driving).resample(both))
+    return path[np.searchsorted(both, time)]
+
+
+def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
+    """Latent states at a time in s, shape ``(latent,)``, from the inputs recorded up to it.
+
+    Where the record begins there, they are at rest. The arguments are those of `latent_path`.
+    """
+    if not model.signals.latents:
+        return np.empty(0)
+    now = max(2, int(np.searchsorted(run.time, start, side="right")))
+    past = run.select(model.signals.driving)
+    past = replace(past, time=past.time[:now], values=past.values[:now])
+    path = latent_path(model, past)
+    return path[-1] if now > 2 else path[0]
+
+
+def rest(time: Array, inputs: Array) -> Array:
+    """Inputs before a record begins, ``(input,)`` from ``(time, input)``."""
+    return inputs[time <= time[0] + _REST].mean(axis=0)
+
+
+# -- adding them to a model ---------------------------------------------------------------------
+
+
+def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Array]) -> DFSM:
+    """A model with latent states in addition.
+
+    Parameters
+    ----------
+    model
+        Has none.
+    found
+        Their dynamics.
+    coupling
+        What one unit of each adds to the derivatives of the other states,
+        ``(state, 2 pair)``.
+    paths
+        Their values along the training runs, each ``(time, 2 pair)``.
+    """
+    s, count = model.signals, coupling.shape[1]
+    at, n = s.state_columns.stop, len(s.states)
+
+    def wider(linear: LinearModel, extra_rows: int) -> LinearModel:
+        L = jnp.insert(linear.coefficients, np.full(count, at), 0.0, axis=2)
+        zero = jnp.zeros((len(L), extra_rows, L.shape[2]))
+        L = jnp.concatenate([L, zero], axis=1)
+        b = jnp.concatenate([linear.offsets, jnp.zeros((len(L), extra_rows))], axis=1)
+        return replace(linear, coefficients=L, offsets=b)
+
+    f = wider(model.f, count)
+    f = replace(f, coefficients=f.coefficients.at[:, :n, at : at + count].set(coupling))
+    names = tuple(Channel(f"latent{k + 1}", "-") for k in range(count))
+    wide = DFSM(
+        f=f,
+        e=None if model.e is None else _ignoring(model.e, at, count),
+        g=None if model.g is None else wider(model.g, 0),
+        e_g=None if model.e_g is None else _ignoring(model.e_g, at, count),
+        region=_with_range(model.region, at, 0, paths),
+        corrected=model.corrected,
+        corrected_outputs=model.corrected_outputs,
+        signals=replace(s, states=(*s.states, *names), latents=names),
+        provenance=model.provenance,
+    )
+    return with_poles(wide, found)
+
+
+def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
+    """The model with the training range of its latent states taken from their paths."""
+    s = model.signals
+    region = _with_range(model.region, s.observed_columns.stop, len(s.latents), paths)
+    return replace(model, region=replace(region, operating=at_rest(model, region.operating)))
+
+
+def _ignoring(corrective: Corrective, at: int, count: int) -> Corrective:
+    """The same function of more inputs, the new ones without effect."""
+    place = np.full(count, at)
+    shift = jnp.insert(corrective.shift, place, 0.0)
+    if isinstance(corrective, GaussianUnits):
+        # Infinitely wide in the new directions.
+        return replace(
+            corrective,
+            shift=shift,
+            scale=jnp.insert(corrective.scale, place, jnp.inf),
+            centres=jnp.insert(corrective.centres, place, 0.0, axis=0),
+        )
+    first, *others = corrective.weights
+    return replace(
+        corrective,
+        shift=shift,
+        scale=jnp.insert(corrective.scale, place, 1.0),
+        weights=(jnp.insert(first, place, 0.0, axis=1), *others),
+    )
+
+
+def _with_range(region: Region, at: int, old: int, paths: Sequence[Array]) -> Region:
+    """Ranges and moments of the inputs with those of `old` columns from `at` on replaced."""
+    z, W = np.concatenate(paths), region.whitening
+    place = np.full(z.shape[1], at)
+    gone = slice(at, at + old)
+
+    def put(values: jax.Array, new: Array) -> jax.Array:
+        kept = np.delete(np.asarray(values), gone, axis=-1)
+        return jnp.asarray(np.insert(kept, place, new, axis=-1))
+
+    return replace(
+        region,
+        low=put(region.low, z.min(axis=0)),
+        high=put(region.high, z.max(axis=0)),
+        mean=put(region.mean, z.mean(axis=0)),
+        std=put(region.std, z.std(axis=0)),
+        operating=put(region.operating, np.tile(z.mean(axis=0), (len(region.grid), 1))),
+        # Latent states follow from what was counted already: they add no distance.
+        whitening=put(W, np.zeros(len(place))) if W.size else W,
+    )

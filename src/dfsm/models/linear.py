@@ -1,0 +1,68 @@
+"""The linear part of a model: an affine map whose coefficients are interpolated in the schedule."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.numerics.hats import hats
+
+
+class LinearModel(eqx.Module):
+    """Affine map ``y = L(s) I + b(s)`` whose coefficients are interpolated in a schedule ``s``.
+
+    Attributes
+    ----------
+    grid
+        Schedule points in the schedule's unit, shape ``(point,)``; one point for an LTI model.
+    coefficients
+        L at every schedule point, in physical units, shape ``(point, target, input)``.
+    offsets
+        b at every schedule point, shape ``(point, target)``.
+    schedule
+        Column of the input vector that schedules, None for an LTI model.
+    known
+        Pairs of target and input whose coefficient was given, not fitted.
+    """
+
+    grid: jax.Array
+    coefficients: jax.Array
+    offsets: jax.Array
+    schedule: int | None = eqx.field(static=True)
+    known: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+
+    @property
+    def known_inputs(self) -> tuple[int, ...]:
+        """Columns of the inputs with a coefficient that was given."""
+        return tuple(sorted({column for _, column in self.known}))
+
+    def at(self, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+        """Return L, shape ``(target, input)``, and b, shape ``(target,)``, at a schedule value.
+
+        Outside the grid the coefficients of the nearest point hold.
+        """
+        if self.schedule is None:
+            return self.coefficients[0], self.offsets[0]
+        n = self.grid.shape[0]
+        value = jnp.clip(value, self.grid[0], self.grid[-1])
+        i = jnp.clip(jnp.sum(value >= self.grid) - 1, 0, n - 2)
+        ends = jax.lax.dynamic_slice_in_dim(self.grid, i, 2)
+        t = (value - ends[0]) / (ends[1] - ends[0])
+        # Slices of two points; general indexing costs several times as much in a rollout.
+        L = jax.lax.dynamic_slice_in_dim(self.coefficients, i, 2)
+        b = jax.lax.dynamic_slice_in_dim(self.offsets, i, 2)
+        return (1 - t) * L[0] + t * L[1], (1 - t) * b[0] + t * b[1]
+
+    def shares(self, inputs: jax.Array) -> jax.Array:
+        """Weight of every schedule point at one input vector, shape ``(point,)``."""
+        return hats(self.grid, inputs[self.schedule or 0])
+
+    def __call__(self, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
+        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``.
+
+        `value` is the schedule's; None takes it from the inputs, see `schedule.scheduled`.
+        """
+        L, b = self.at(inputs[self.schedule or 0] if value is None else value)
+        return L @ inputs + b

@@ -1,0 +1,210 @@
+"""A model as a folder: arrays in safetensors, everything else in a readable JSON manifest.
+
+Nothing in the folder is executed when it is read. The arrays are stored in 64 bits, so a model
+predicts bit for bit the same after it has been saved and loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from dfsm.core.bundle import MANIFEST, Bundle
+from dfsm.core.files import check_folder
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError
+from dfsm.models.corrective import Corrective, GaussianUnits, Perceptron
+from dfsm.models.dfsm import DFSM
+from dfsm.models.linear import LinearModel
+from dfsm.models.region import Region
+from dfsm.models.signals import Provenance, SignalTable
+
+FORMAT = 1
+TENSORS = "model.safetensors"
+MULTI_FIDELITY, NONLINEAR = "multi-fidelity", "nonlinear-only"
+_BUNDLE = Bundle(TENSORS, FORMAT, "fit the model again")
+
+
+def save(model: DFSM, path: str | Path, nonlinear: DFSM | None = None) -> None:
+    """Write a model folder; an existing model folder there is replaced in one step.
+
+    Parameters
+    ----------
+    model
+        The multi-fidelity model.
+    path
+        Folder to make.
+    nonlinear
+        The nonlinear-only model to keep beside it for comparisons.
+
+    Raises
+    ------
+    DfsmError
+        `path` holds something else, or cannot be written.
+    """
+    models = {MULTI_FIDELITY: model} | ({NONLINEAR: nonlinear} if nonlinear is not None else {})
+    tensors: dict[str, Array] = {}
+    structure = {name: _take_apart(m, name, tensors) for name, m in models.items()}
+    content = {
+        "signals": asdict(model.signals),
+        "models": structure,
+        "provenance": dict(model.provenance.record),
+    }
+    _BUNDLE.write(path, tensors, content, _is_model)
+
+
+def check_target(path: str | Path) -> None:
+    """Fail early where `save` would fail: before hours of work, not after.
+
+    Raises
+    ------
+    DfsmError
+        `path` exists and is not a model folder, or its parent does not exist.
+    """
+    check_folder(path, is_ours=_is_model)
+
+
+def load(path: str | Path) -> DFSM:
+    """Read the multi-fidelity model of a model folder.
+
+    Raises
+    ------
+    DfsmError
+        The folder is missing, not a model, damaged, or written by a newer version.
+    """
+    return load_all(path)[MULTI_FIDELITY]
+
+
+def load_all(path: str | Path) -> dict[str, DFSM]:
+    """Read all models of a model folder by name: multi-fidelity, and nonlinear-only if kept."""
+    path = Path(path)
+    manifest = _read_manifest(path)
+    tensors = _BUNDLE.read_tensors(path, manifest)
+    try:
+        signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
+        provenance = Provenance(manifest["provenance"])
+        return {
+            name: _put_together(structure, name, tensors, signals, provenance)
+            for name, structure in manifest["models"].items()
+        }
+    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        raise _BUNDLE.damaged(
+            path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]
+        ) from None
+
+
+# -- taking apart and putting together ----------------------------------------------------------
+
+
+def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str, Any]:
+    """Put the arrays of a model under ``prefix/…`` into `tensors`; return the rest."""
+
+    def keep(name: str, module: Any, fields: tuple[str, ...]) -> None:
+        for field in fields:
+            tensors[f"{prefix}/{name}/{field}"] = np.asarray(getattr(module, field))
+
+    structure: dict[str, Any] = {
+        "corrected": list(model.corrected),
+        "corrected_outputs": list(model.corrected_outputs),
+        "latents": len(model.signals.latents),
+    }
+    keep("region", model.region, _REGION)
+    structure["region"] = {"fixed": model.region.fixed, "schedule": model.region.schedule}
+    for name, linear in (("f", model.f), ("g", model.g)):
+        structure[name] = None
+        if linear is not None:
+            keep(name, linear, _LINEAR)
+            structure[name] = {"schedule": linear.schedule, "known": linear.known}
+    for name, corrective in (("e", model.e), ("e_g", model.e_g)):
+        structure[name] = None
+        if isinstance(corrective, GaussianUnits):
+            keep(name, corrective, _GAUSSIAN)
+            structure[name] = {"kind": "gaussian_units"}
+        elif isinstance(corrective, Perceptron):
+            keep(name, corrective, ("shift", "scale"))
+            for i, (W, b) in enumerate(zip(corrective.weights, corrective.biases, strict=True)):
+                tensors[f"{prefix}/{name}/weights.{i}"] = np.asarray(W)
+                tensors[f"{prefix}/{name}/biases.{i}"] = np.asarray(b)
+            structure[name] = {"kind": "perceptron", "layers": len(corrective.weights)}
+    return structure
+
+
+_REGION = ("low", "high", "mean", "std", "grid", "operating", "whitening")
+_NO_DENSITY = np.zeros((0, 0, 0))  # of models that were saved before they had one
+_LINEAR = ("grid", "coefficients", "offsets")
+_GAUSSIAN = ("shift", "scale", "centres", "weights", "bias")
+
+
+def _put_together(
+    structure: Mapping[str, Any],
+    prefix: str,
+    tensors: Mapping[str, Array],
+    signals: SignalTable,
+    provenance: Provenance,
+) -> DFSM:
+    given = {f"{prefix}/region/whitening": _NO_DENSITY, **tensors}
+
+    def arrays(name: str, fields: tuple[str, ...]) -> list[Any]:
+        return [jnp.asarray(given[f"{prefix}/{name}/{field}"]) for field in fields]
+
+    def linear(name: str) -> LinearModel | None:
+        found = structure[name]
+        if found is None:
+            return None
+        grid, coefficients, offsets = arrays(name, _LINEAR)
+        known = tuple((int(row), int(column)) for row, column in found.get("known", ()))
+        return LinearModel(grid, coefficients, offsets, found["schedule"], known)
+
+    def corrective(name: str) -> Corrective | None:
+        found = structure[name]
+        if found is None:
+            return None
+        if found["kind"] == "gaussian_units":
+            return GaussianUnits(*arrays(name, _GAUSSIAN))
+        layers = range(found["layers"])
+        return Perceptron(
+            *arrays(name, ("shift", "scale")),
+            weights=tuple(arrays(name, tuple(f"weights.{i}" for i in layers))),
+            biases=tuple(arrays(name, tuple(f"biases.{i}" for i in layers))),
+        )
+
+    f = linear("f")
+    if f is None:
+        raise KeyError("f")
+    if not structure.get("latents", 0):
+        # The nonlinear-only model beside a refined one has none.
+        signals = replace(signals, states=signals.observed, latents=())
+    return DFSM(
+        f=f,
+        e=corrective("e"),
+        g=linear("g"),
+        e_g=corrective("e_g"),
+        region=Region(*arrays("region", _REGION), **structure.get("region", {})),
+        corrected=tuple(structure["corrected"]),
+        corrected_outputs=tuple(structure["corrected_outputs"]),
+        signals=signals,
+        provenance=provenance,
+    )
+
+
+# -- reading safely -----------------------------------------------------------------------------
+
+
+def _is_model(path: Path) -> bool:
+    # Both files: other programs write a manifest.json too.
+    return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    if not path.is_dir():
+        kind = "a file" if path.exists() else "missing"
+        raise DfsmError(f"{path} is {kind}; a model folder as 'dfsm fit' writes it was expected")
+    if not (path / MANIFEST).exists():
+        raise DfsmError(f"{path} holds no {MANIFEST}, so it is not a model folder")
+    return _BUNDLE.read_manifest(path)

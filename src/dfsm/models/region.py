@@ -1,0 +1,106 @@
+"""Where the training data of a model lie: ranges, and Mahalanobis's distance along the schedule."""
+
+from __future__ import annotations
+
+from dataclasses import field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.numerics.hats import hats
+
+
+def squared_distance(
+    inputs: jax.Array, shares: jax.Array, middles: jax.Array, W: jax.Array
+) -> jax.Array:
+    """Σ_k h_k |W_k (I − μ_k)|² of inputs ``(..., input)`` and shares h ``(..., point)``."""
+    apart = jnp.einsum("kri,...i->...kr", W, inputs) - jnp.einsum("kri,ki->kr", W, middles)
+    return jnp.einsum("...k,...kr,...kr->...", shares, apart, apart)
+
+
+# Of the squared distance that is usual: what disturbances leave to controls and states at least.
+_LEFT = 0.2
+
+
+class Region(eqx.Module):
+    """Where the training data lie, and what they look like along the schedule.
+
+    Attributes
+    ----------
+    low, high
+        Range of every input over the training runs, widened by one quantisation step, shape
+        ``(input,)``.
+    mean, std
+        Over all training samples, shape ``(input,)``.
+    grid
+        Schedule values of the operating points, shape ``(point,)``; one for an LTI model.
+    operating
+        Mean of every input at each, shape ``(point, input)``.
+    whitening
+        W at each, shape ``(point, input, input)``, see `distance`; empty where nothing is known of
+        how the inputs occur together.
+    fixed
+        How many rows of W see only what nobody chooses: disturbances and parameters.
+    schedule
+        Column of the input that schedules, None for an LTI model.
+    """
+
+    low: jax.Array
+    high: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    grid: jax.Array
+    operating: jax.Array
+    whitening: jax.Array = field(default_factory=lambda: jnp.zeros((0, 0, 0)))
+    fixed: int = eqx.field(static=True, default=0)
+    schedule: int | None = eqx.field(static=True, default=None)
+
+    @property
+    def scale(self) -> jax.Array:
+        """What standardised inputs are divided by: `std`, and 1 for what does not vary."""
+        return jnp.where(self.std > 0, self.std, 1.0)
+
+    def outside(self, inputs: ArrayLike) -> jax.Array:
+        """Tell which samples of ``(..., input)`` are outside the training data.
+
+        Either an input is outside its range, or all together are farther from what occurred
+        together than samples of a new run usually are.
+        """
+        # An optimum that is kept inside meets the limit to a solver's tolerance.
+        return jnp.any(self.beyond(inputs), axis=-1) | (self.distance(inputs) > 1 + 1e-6)
+
+    def beyond(self, inputs: ArrayLike) -> jax.Array:
+        """Tell which of ``(..., input)`` are outside their own training range."""
+        slack = 1e-9 * (self.high - self.low)
+        inputs = jnp.asarray(inputs)
+        return (inputs < self.low - slack) | (inputs > self.high + slack)
+
+    def distance(self, inputs: ArrayLike) -> jax.Array:
+        """Squared distance of ``(..., input)`` from the training data: 1 is as far as is usual.
+
+        Mahalanobis's, Σ_k h_k |W_k (I − μ_k)|² over the operating points k with hat functions h of
+        the schedule. 98 % of the training samples are nearer, measured by the other runs.
+        """
+        return self._squared(jnp.asarray(inputs), slice(None))
+
+    def distance_chosen(self, inputs: ArrayLike, value: jax.Array | None = None) -> jax.Array:
+        """What controls and states add to the distance, over what the disturbances leave for them.
+
+        1 where all of ``(..., input)`` are as far from the training data as is usual. Disturbances
+        that are unusual themselves leave at least a fifth: somewhat more than controls and states
+        of the training runs take on average. `value` is the schedule's, ``(...)``; None takes it
+        from the inputs.
+        """
+        inputs = jnp.asarray(inputs)
+        given = self._squared(inputs, slice(self.fixed), value)
+        added = self._squared(inputs, slice(self.fixed, None), value)
+        return added / jnp.maximum(1 - given, _LEFT)
+
+    def _squared(self, inputs: jax.Array, rows: slice, value: jax.Array | None = None) -> jax.Array:
+        if not self.whitening.size:
+            return jnp.zeros(inputs.shape[:-1])
+        shares = hats(self.grid, inputs[..., self.schedule or 0] if value is None else value)
+        return squared_distance(inputs, shares, self.operating, self.whitening[:, rows])

@@ -1,0 +1,225 @@
+"""What the vectors of a model mean: names, units, roles, training region, blade harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.settings import require, settings_class
+from dfsm.core.units import SPEEDS
+from dfsm.data.derivatives import DerivativeSettings, StateSpec
+from dfsm.data.features import Feature, with_features
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind import CORRECTED_WIND, undisturbed_rotor_wind
+from dfsm.errors import DfsmError, near_matches
+
+
+@settings_class
+class Azimuth:
+    """Blade-passing harmonics of the rotor azimuth ψ = ∫ω dt as inputs of ĝ (Sec. 3.7).
+
+    No state holds the blade-passing frequency, so a peak there in an output can only come from
+    these or from the inputs.
+
+    Attributes
+    ----------
+    speed
+        State that holds the rotor speed, in rpm, rad/s or deg/s.
+    angle
+        Channel with the recorded azimuth in deg: it gives the phase in training, and at the start
+        of a simulation. None integrates the recorded speed from zero, which leaves the phase of
+        every run to chance.
+    blades
+        Harmonics are cos(blades ψ) and sin(blades ψ).
+    """
+
+    speed: str
+    angle: str | None = None
+    blades: int = 3
+
+    def __post_init__(self) -> None:
+        require(self.blades >= 1, "azimuth.blades", self.blades, "at least 1")
+
+
+@dataclass(frozen=True)
+class SignalTable:
+    """The channels of a model in the order of its vectors, with units.
+
+    Attributes
+    ----------
+    states, controls, disturbances, parameters, outputs
+        One `Channel` per element of ξ, u, w, p and y.
+    latents
+        The last of the states: those that no channel holds, see `latents.py`.
+    specs
+        Which states are measured and which are their rates, see `StateSpec`.
+    derivatives
+        How derivatives were extracted; initial rates of a rollout are found the same way.
+    azimuth
+        Blade-passing harmonics of the output function, if any.
+    hub_height
+        In m; where set, runs get the rotor wind corrected for the platform's motion as channel
+        ``RtVAvgxhCorr``, see `undisturbed_rotor_wind`.
+    features
+        Disturbances that are computed from others, see `with_features`.
+    """
+
+    states: tuple[Channel, ...]
+    controls: tuple[Channel, ...]
+    disturbances: tuple[Channel, ...]
+    parameters: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    specs: tuple[StateSpec, ...]
+    derivatives: DerivativeSettings = field(hash=False)
+    azimuth: Azimuth | None = None
+    hub_height: float | None = None
+    features: tuple[Feature, ...] = ()
+    latents: tuple[Channel, ...] = ()
+
+    @property
+    def inputs(self) -> tuple[Channel, ...]:
+        """Channels of I = [u, w, ξ, p]."""
+        return (*self.controls, *self.disturbances, *self.states, *self.parameters)
+
+    @property
+    def observed(self) -> tuple[Channel, ...]:
+        """The states that a recorded run holds: all but the latent ones."""
+        return self.states[: len(self.states) - len(self.latents)]
+
+    @property
+    def driving(self) -> tuple[str, ...]:
+        """Names of controls and disturbances, the columns of B."""
+        return tuple(c.name for c in (*self.controls, *self.disturbances))
+
+    @property
+    def state_columns(self) -> slice:
+        """Where the states stand in I."""
+        first = len(self.controls) + len(self.disturbances)
+        return slice(first, first + len(self.states))
+
+    @property
+    def observed_columns(self) -> slice:
+        """Where the states that a recorded run holds stand in I."""
+        return slice(self.state_columns.start, self.state_columns.stop - len(self.latents))
+
+    @property
+    def exogenous(self) -> tuple[str, ...]:
+        """Names of what drives a simulation: controls, disturbances, parameters."""
+        return tuple(c.name for c in (*self.controls, *self.disturbances, *self.parameters))
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the channels that an initial state is taken from."""
+        return tuple(n for s in self.specs for n in (s.name, s.rate) if n is not None)
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Names of the channels that a run holds which the model can be compared with."""
+        states = [n for s in self.specs for n in s.channels]
+        return (*self.exogenous, *states, *self.names("outputs"))
+
+    def names(self, group: str) -> tuple[str, ...]:
+        """Names of one group, e.g. ``names("states")``."""
+        return tuple(c.name for c in getattr(self, group))
+
+    @property
+    def azimuth_rate(self) -> tuple[int, float] | None:
+        """State that turns the azimuth and the rad/s in one of its units."""
+        if self.azimuth is None:
+            return None
+        names = self.names("states")
+        if self.azimuth.speed not in names:
+            raise DfsmError(
+                f"azimuth.speed is '{self.azimuth.speed}', which is not a state; "
+                + near_matches(self.azimuth.speed, names)
+            )
+        column = names.index(self.azimuth.speed)
+        return column, radians_per_second(self.states[column])
+
+
+def with_computed(
+    run: Trajectory, hub_height: float | None, features: Iterable[Feature] = ()
+) -> Trajectory:
+    """Add the channels that are computed from others, the same in training and in use.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    hub_height
+        In m; where set, a run without the corrected rotor wind gets it.
+    features
+        See `with_features`.
+    """
+    if hub_height is not None and CORRECTED_WIND not in run:
+        run = undisturbed_rotor_wind(run, hub_height)
+    return with_features(run, features)
+
+
+def require_constant(run: Trajectory, parameters: Iterable[str]) -> None:
+    """Refuse a run in which a parameter varies by more than it is rounded.
+
+    Raises
+    ------
+    DfsmError
+        Names the run, the first such parameter and its range.
+    """
+    for name in parameters:
+        values, channel = run[name], run.channel(name)
+        low, high = float(values.min()), float(values.max())
+        if high - low > (channel.step or 0.0) + 1e-9 * max(abs(low), abs(high)):
+            unit = f" {channel.unit}" if channel.unit else ""
+            raise DfsmError(
+                f"{run.where}: parameter '{name}' goes from {low:g} to {high:g}{unit}, but "
+                "parameters are constant within a run: give it as a disturbance or control"
+            )
+
+
+def radians_per_second(speed: Channel) -> float:
+    """The rad/s in one unit of a speed channel.
+
+    Raises
+    ------
+    DfsmError
+        The unit is not one of a rotational speed.
+    """
+    if speed.unit not in SPEEDS:
+        raise DfsmError(
+            f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of "
+            f"{', '.join(SPEEDS)}"
+        )
+    return SPEEDS[speed.unit]
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """Where a model comes from: settings, data, figures of the fit; all of it JSON values.
+
+    It never enters compiled code. All instances compare equal, so that models which differ only
+    in their history share a compilation.
+
+    Attributes
+    ----------
+    record
+        Keys ``settings``, ``data``, ``rows``, ``warnings``, ``versions``, ``seconds``, ….
+    """
+
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Provenance)
+
+    def __hash__(self) -> int:
+        return hash(Provenance)
+
+
+def blade_harmonics(azimuth: ArrayLike, blades: int) -> jax.Array:
+    """Return cos(blades ψ) and sin(blades ψ), shape ``(..., 2)``, for ψ in rad."""
+    angle = blades * jnp.asarray(azimuth)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)

@@ -1,0 +1,79 @@
+"""Power spectral densities, their peaks, and the power in frequency bands (Sec. 4.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import trapezoid
+from scipy.signal import welch
+
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError
+
+
+@dataclass(frozen=True)
+class Band:
+    """A frequency range in Hz with a name, e.g. the wave band."""
+
+    name: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A one-sided power spectral density.
+
+    Attributes
+    ----------
+    frequency
+        In Hz, shape ``(bin,)``.
+    density
+        In the signal's unit squared per Hz, shape ``(bin,)``.
+    """
+
+    frequency: Array
+    density: Array
+
+    def peak(self, band: Band) -> float | None:
+        """Frequency of the largest density in a band, in Hz; None if it holds no bin."""
+        inside = self._inside(band)
+        if not inside.any():
+            return None
+        return float(self.frequency[inside][np.argmax(self.density[inside])])
+
+    def power(self, band: Band) -> float:
+        """Variance in a band, in the signal's unit squared."""
+        inside = self._inside(band)
+        return float(trapezoid(self.density[inside], self.frequency[inside]))
+
+    def _inside(self, band: Band) -> NDArray[np.bool_]:
+        return (self.frequency >= band.low) & (self.frequency <= band.high)
+
+
+def spectrum(time: Array, values: Array, segment: float = 200.0) -> Spectrum:
+    """Welch's estimate: Hann windows of `segment` seconds, half overlapping, mean removed.
+
+    Parameters
+    ----------
+    time
+        Equidistant mesh in s, shape ``(time,)``; resample an irregular one first.
+    values
+        Unfiltered samples, shape ``(time,)``.
+    segment
+        Segment length in s; a shorter record is one segment.
+
+    Raises
+    ------
+    DfsmError
+        The mesh is not equidistant.
+    """
+    steps = np.diff(time)
+    step = float(steps.mean())
+    if np.ptp(steps) > 1e-3 * step:
+        raise DfsmError("a spectrum needs an equidistant time mesh: resample the run first")
+    size = min(len(values), round(segment / step))
+    frequency, density = welch(values, fs=1 / step, window="hann", nperseg=size)
+    return Spectrum(frequency, density)

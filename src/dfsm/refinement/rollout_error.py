@@ -1,0 +1,356 @@
+"""The error of rollouts over windows of recorded runs, as a function of a model's parameters.
+
+Least squares, generalised where runs have the same disturbances: what a model does not see of these
+errs in all of them alike, so that their errors r₁ … r_m correlate, by ρ say, and
+
+    (Σ |rᵢ|² - ρ / (1 + (m - 1) ρ) |Σ rᵢ|²) / (1 - ρ)
+
+is what counts (Aitken 1935, for equal correlations). It weighs differences between such runs, which
+are what controls and states do, more than what the runs have in common. Slopes come run by run, so
+that memory does not grow with the number of runs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.types import Array, IntArray
+from dfsm.data.derivatives import differentiate
+from dfsm.data.trajectory import Trajectory
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import Poles, as_states, evolve, poles, rest
+from dfsm.models.signals import with_computed
+from dfsm.numerics.filters import moving_average
+from dfsm.refinement.growth import StabilityKept
+from dfsm.refinement.parameters import Parametrization
+from dfsm.refinement.slopes import FAR, sensitivities
+from dfsm.simulation.integrate import exogenous_groups, rk4
+
+# JᵀJ is summed over every fourth step, and over more where windows have few: slopes hardly change
+# from one to the next, and products of their matrices would be most of the time. Jᵀr is exact.
+_EVERY, _FEWEST = 4, 10
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run on an equidistant mesh.
+
+    Attributes
+    ----------
+    step
+        In s.
+    before
+        Steps between the start of the record and the first state; latent states need them.
+    states, slopes
+        Observed states and their derivatives, shape ``(step + 1, state)``.
+    inputs
+        Exogenous inputs at ends and middles of all steps, those before the first state included,
+        ``(2 (before + step) + 1, exogenous)``.
+    rest
+        Controls and disturbances before the record begins.
+    """
+
+    step: float
+    before: int
+    states: Array
+    slopes: Array
+    inputs: Array
+    rest: Array
+
+    def follow(self, found: Poles) -> Array:
+        """Latent pairs from the start of the record on, complex, ``(before + step + 1, pair)``."""
+        h = jnp.full(len(self.inputs) // 2, self.step)
+        v = jnp.asarray(self.inputs[::2, : len(self.rest)])
+        return np.asarray(evolve(found, h, v, jnp.asarray(self.rest)))
+
+    def latent_states(self, model: DFSM) -> Array:
+        """A model's latent states from the first state on, ``(step + 1, latent)``."""
+        pairs = self.follow(poles(model))[self.before :]
+        return np.asarray(as_states(jnp.asarray(pairs)))
+
+    def left_over(self, model: DFSM) -> Array:
+        """Recorded minus modelled derivatives of the observed states, ``(step + 1, state)``."""
+        states = np.concatenate([self.states, self.latent_states(model)], axis=1)
+        exogenous = exogenous_groups(model, jnp.asarray(self.inputs[2 * self.before :: 2]))
+        modelled = np.asarray(model.derivative(states, *exogenous))
+        return self.slopes - modelled[:, : self.slopes.shape[1]]
+
+
+def record_of(
+    model: DFSM, run: Trajectory, step: float, start: float | None, stop: float | None
+) -> Record:
+    """Put a run on the mesh of the refinement.
+
+    Parameters
+    ----------
+    model
+        Says which channels are what.
+    run
+        The whole record.
+    step
+        In s; inputs are averaged over it.
+    start, stop
+        Time window in s of the states.
+    """
+    s = model.signals
+    run = with_computed(run, s.hub_height, s.features)
+    found = differentiate(run, s.specs, s.derivatives)
+    window = run.window(start, stop)
+    count = int(window.duration / step * (1 + 1e-9))
+    before = int((window.time[0] - run.time[0]) / step * (1 + 1e-9))
+    mesh = window.time[0] + step / 2 * np.arange(-2 * before, 2 * count + 1)
+    run.select(s.exogenous).require_finite()
+    dense = run.time_step is not None and run.time_step < step / 2
+    inputs = [
+        np.interp(mesh, run.time, moving_average(run.time, run[n], step) if dense else run[n])
+        for n in s.exogenous
+    ]
+    states = found.trajectory.select(found.names)
+    at = mesh[2 * before :: 2]
+    slopes = [np.interp(at, run.time, d) for d in found.derivatives.T]
+    return Record(
+        step,
+        before,
+        states.resample(at).values,
+        np.stack(slopes, axis=1),
+        np.stack(inputs, axis=1),
+        rest(run.time, run.select(s.driving).values),
+    )
+
+
+class _Windows(NamedTuple):
+    """The windows of one run.
+
+    Attributes
+    ----------
+    step
+        In s.
+    states
+        Shape ``(window, time, state)``.
+    inputs
+        At ends and middles, ``(window, 2 time - 1, exogenous)``.
+    first
+        Steps from the start of the record to that of each window.
+    record, rest
+        Controls and disturbances of the whole record at the ends of steps, and before it.
+    """
+
+    step: float
+    states: Array
+    inputs: Array
+    first: IntArray
+    record: Array
+    rest: Array
+
+
+def _windows(record: Record, length: float | None) -> _Windows:
+    steps = len(record.states) - 1
+    each = steps if length is None else min(steps, round(length / record.step))
+    first = np.arange(0, steps - each + 1, each)
+    begin = 2 * (first + record.before)
+    return _Windows(
+        record.step,
+        np.stack([record.states[i : i + each + 1] for i in first]),
+        np.stack([record.inputs[i : i + 2 * each + 1] for i in begin]),
+        first + record.before,
+        record.inputs[::2, : len(record.rest)],
+        record.rest,
+    )
+
+
+@dataclass(frozen=True)
+class ErrorWeights:
+    """What errors count.
+
+    Attributes
+    ----------
+    states
+        Weights of the observed states' squared errors, shape ``(state,)``.
+    correlation
+        ρ between the errors of runs with the same disturbances, at least 0 and less than 1.
+    decay
+        Weight of the parameters' squared deviations.
+    """
+
+    states: Array
+    correlation: float = 0.0
+    decay: float = 0.0
+
+    def whitening(self, runs: int) -> tuple[float, float]:
+        """Factors of Σ |rᵢ|² and -|Σ rᵢ|², for so many runs with the same disturbances."""
+        if runs == 1:
+            return 1.0, 0.0
+        own = 1 / (1 - self.correlation)
+        return own, own * self.correlation / (1 + (runs - 1) * self.correlation)
+
+
+class RolloutError:
+    """Squared errors of rollouts over windows, with JᵀJ and Jᵀr by forward sensitivities.
+
+    Parameters
+    ----------
+    parameters
+        What may change.
+    groups
+        Runs to follow; those of one group have the same disturbances at the same times.
+    length
+        Of the windows in s; None takes whole runs.
+    counts
+        See `ErrorWeights`.
+    kept
+        What else adds to the cost.
+    """
+
+    def __init__(
+        self,
+        parameters: Parametrization,
+        groups: Sequence[Sequence[Record]],
+        length: float | None,
+        counts: ErrorWeights,
+        kept: StabilityKept | None = None,
+    ) -> None:
+        self._parameters, self._counts, self._kept = parameters, counts, kept
+        self._groups = [tuple(_windows(r, length) for r in group) for group in groups]
+        overall = np.concatenate([r.states for group in groups for r in group]).std(axis=0)
+        self._scales = []
+        for group in groups:
+            spread = np.sqrt(np.mean([r.states.var(axis=0) for r in group], axis=0))
+            # A state that hardly moves in one run must not outweigh all others.
+            self._scales.append(np.sqrt(counts.states) / np.maximum(spread, 0.1 * overall))
+        self._count = sum(w.states[:, 1:].size for group in self._groups for w in group)
+
+    def _over_groups(self, function: Callable[..., Any], weights: Array) -> list[Any]:
+        w = jnp.asarray(weights)
+
+        def one(group: tuple[_Windows, ...], scale: Array) -> Any:
+            factors = self._counts.whitening(len(group))
+            return function(self._parameters, w, group, scale, factors)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            return list(pool.map(one, self._groups, self._scales))
+
+    def cost(self, weights: Array) -> float:
+        """All that is to be made small, infinite where a rollout is not finite."""
+        extra = 0.0 if self._kept is None else self._kept.cost(weights)
+        if not np.isfinite(extra):
+            return np.inf
+        decay = self._counts.decay * float(weights @ weights)
+        return self.relative(weights) * self._count + decay + extra
+
+    def relative(self, weights: Array) -> float:
+        """Mean square of r: 1 is as wrong as a constant; infinite where one is not finite."""
+        total = sum(self._over_groups(_square, weights))
+        return total / self._count if np.isfinite(total) else np.inf
+
+    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
+        """JᵀJ and Jᵀr of all of it."""
+        parts = self._over_groups(_products, weights)
+        JtJ, Jtr = (reduce(np.add, [p[k] for p in parts]) for k in (0, 1))
+        if self._kept is not None:
+            kept = self._kept.normal_equations(weights)
+            JtJ, Jtr = (a + b for a, b in zip((JtJ, Jtr), kept, strict=True))
+        decay = self._counts.decay
+        return JtJ + decay * np.eye(len(Jtr)), Jtr + decay * weights
+
+
+def _square(
+    parameters: Parametrization,
+    w: jax.Array,
+    group: Sequence[_Windows],
+    scale: Array,
+    factors: tuple[float, float],
+) -> float:
+    """What the errors over the windows of one group count, by the factors of `whitening`."""
+    each = [np.asarray(_errors(parameters, w, windows, scale)) for windows in group]
+    own, shared = factors
+    return float(own * np.sum(np.square(each)) - shared * np.sum(np.sum(each, axis=0) ** 2))
+
+
+@eqx.filter_jit
+def _errors(
+    parameters: Parametrization, w: jax.Array, windows: _Windows, scale: Array
+) -> jax.Array:
+    """Errors over the windows of one run, scaled, ``(window, time, state)``."""
+    model = parameters.at(w).prepared()
+    h = jnp.full(windows.states.shape[1] - 1, windows.step)
+    follow = jax.vmap(lambda x0, v: rk4(model, x0, h, v, FAR))
+    xs = follow(_starts(model, windows), jnp.asarray(windows.inputs))
+    return (xs[:, 1:, : len(scale)] - windows.states[:, 1:]) * scale
+
+
+def _products(
+    parameters: Parametrization,
+    w: jax.Array,
+    group: Sequence[_Windows],
+    scale: Array,
+    factors: tuple[float, float],
+) -> tuple[Array, Array]:
+    """JᵀJ, nearly, and Jᵀr over the windows of one group; `factors` as in `_square`."""
+    own, shared = factors
+    errors = [np.asarray(_errors(parameters, w, windows, scale)) for windows in group]
+    total = np.sum(errors, axis=0)
+    JtJ, Jtr, J_sum = 0.0, 0.0, 0.0
+    for windows, r in zip(group, errors, strict=True):
+        J, slope = _slopes(parameters, w, windows, scale, own * r - shared * total)
+        J = np.asarray(J)
+        # NumPy computes one half of this product only, and other threads go on meanwhile.
+        JtJ, Jtr = JtJ + own * (J.T @ J), Jtr + np.asarray(slope)
+        if shared:
+            J_sum = np.add(J_sum, J)
+    if shared:
+        J_sum = np.asarray(J_sum)
+        JtJ = JtJ - shared * (J_sum.T @ J_sum)
+    return np.asarray(JtJ), np.asarray(Jtr)
+
+
+@eqx.filter_jit
+def _slopes(
+    parameters: Parametrization, w: jax.Array, windows: _Windows, scale: Array, errors: Array
+) -> tuple[jax.Array, jax.Array]:
+    """Rows of J that stand for all over the windows of one run, and Jᵀ times errors."""
+    starts = _starts(parameters.at(w), windows)
+    slopes = _start_slopes(parameters, w, windows)
+    steps = errors.shape[1]
+    every = max(1, min(_EVERY, steps // _FEWEST))
+    follow = partial(sensitivities, parameters, w, windows.step, every=every)
+    each = (starts, slopes, jnp.asarray(windows.inputs), jnp.asarray(errors * scale))
+    S, totals = jax.lax.map(lambda one: follow(*one), each)
+    J = S * (scale * np.sqrt(steps / (steps // every)))[:, None]
+    return J.reshape(-1, w.size), totals.sum(axis=0)
+
+
+def _start_slopes(parameters: Parametrization, w: jax.Array, windows: _Windows) -> jax.Array:
+    """Slopes of the latent pairs at the starts, ``(window, pair, 2, own)``."""
+    columns = parameters.latent_columns
+    pairs, own = columns.shape
+    if not pairs:
+        return jnp.zeros((len(windows.first), 0, 2, own))
+
+    def starts(change: jax.Array) -> jax.Array:
+        # Each pair follows its own parameters, so one direction serves all pairs.
+        moved = w.at[columns].add(change)
+        latent = _starts(parameters.at(moved), windows)[:, -2 * pairs :]
+        return latent.reshape(-1, pairs, 2)
+
+    return jax.jacfwd(starts)(jnp.zeros(own))
+
+
+def _starts(model: DFSM, windows: _Windows) -> jax.Array:
+    """States at the start of every window; latent ones follow from the inputs before it."""
+    measured = jnp.asarray(windows.states[:, 0])
+    if not model.signals.latents:
+        return measured
+    record = jnp.asarray(windows.record)
+    h = jnp.full(len(record) - 1, windows.step)
+    path = as_states(evolve(poles(model), h, record, jnp.asarray(windows.rest)))
+    return jnp.concatenate([measured, path[windows.first]], axis=1)

@@ -1,0 +1,228 @@
+"""Rollouts with their exact slopes in a model's parameters.
+
+Forward sensitivities, S = dξ/dθ, taken through the same Runge-Kutta steps as the states,
+
+    Ṡ = (∂f̂/∂ξ) S + ∂f̂/∂θ .
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import poles
+from dfsm.refinement.parameters import Parametrization
+from dfsm.simulation.integrate import clip_range, exogenous_groups, rate
+
+# A rollout that leaves the training range this many half-ranges from its middle is cut off there:
+# the error stays finite and still has a slope.
+FAR = 30.0
+# Steps whose slopes are computed at once.
+_BLOCK = 48
+
+# States, and slopes of the latent pairs.
+_At = tuple[jax.Array, jax.Array]
+
+
+def sensitivities(
+    parameters: Parametrization,
+    w: jax.Array,
+    step: float,
+    x0: jax.Array,
+    pairs0: jax.Array,
+    v: jax.Array,
+    errors: jax.Array,
+    every: int,
+) -> tuple[jax.Array, jax.Array]:
+    """Slopes of the observed states along a rollout, as `rk4` would find them.
+
+    Once the path is known, what each step does to the slopes, S ← Φ S + G, follows for all steps
+    at once; only that recursion is left to march. A latent pair depends on its own parameters
+    alone, so that its slopes are few and travel with the states.
+
+    Parameters
+    ----------
+    parameters, w
+        The model.
+    step
+        In s.
+    x0
+        States at the start, shape ``(state,)``.
+    pairs0
+        Slopes of the latent pairs there, shape ``(pair, 2, own)``.
+    v
+        Exogenous inputs at ends and middles, ``(2 step + 1, exogenous)``.
+    errors
+        Factors e of the slopes in a sum, ``(step, observed state)``.
+    every
+        After how many steps slopes are kept; the sum is over all.
+
+    Returns
+    -------
+    tuple of Array
+        S after every so many steps, ``(step // every, observed state, parameter)``, and Σ Sᵀ e,
+        ``(parameter,)``.
+    """
+    model = parameters.at(w)
+    path = _path(parameters, model, step, x0, pairs0, v)
+    observed, steps = len(model.signals.observed), len(path.states)
+
+    def along(
+        at: tuple[jax.Array, jax.Array], block: tuple[_Path, jax.Array]
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        S, total = at
+        part, e = block
+        S, each = jax.lax.scan(_advance, S, _transitions(parameters, w, model, step, part))
+        return (S, total + jnp.einsum("tap,ta->p", each, e)), each[every - 1 :: every]
+
+    # Blocks stay in the cache; beyond the end the last step is repeated, and does not count.
+    size = -(-min(_BLOCK, steps) // every) * every
+    count = -(-steps // size)
+
+    def blocks(a: jax.Array, mode: str) -> jax.Array:
+        end = [(0, count * size - steps)] + [(0, 0)] * (a.ndim - 1)
+        return jnp.pad(a, end, mode=mode).reshape(count, size, *a.shape[1:])
+
+    along_path = jax.tree.map(partial(blocks, mode="edge"), path)
+    start = jnp.zeros((observed, w.size)), jnp.zeros(w.size)
+    (_, total), S = jax.lax.scan(along, start, (along_path, blocks(errors, "constant")))
+    return S.reshape(-1, observed, w.size)[: steps // every], total
+
+
+def _advance(S: jax.Array, transition: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    S = transition[0] @ S + transition[1]
+    return S, S
+
+
+def _transitions(
+    parameters: Parametrization, w: jax.Array, model: DFSM, step: float, path: _Path
+) -> tuple[jax.Array, jax.Array]:
+    """Φ and G of every step, S ← Φ S + G.
+
+    Parameters
+    ----------
+    parameters, w, model
+        What may change, how much it has changed, and the model that makes.
+    step
+        In s.
+    path
+        Some steps of the rollout.
+
+    Returns
+    -------
+    tuple of Array
+        Shapes ``(step, observed state, observed state)`` and ``(step, observed state, parameter)``.
+    """
+    observed, columns = len(model.signals.observed), parameters.latent_columns
+    A = jax.vmap(jax.vmap(partial(_state_matrix, model.prepared())))(path.inputs)
+    own = A[..., :observed]
+    free = path.free[:, :observed]
+    weights = _stage_weights(own, step) * free[:, None, :, None]
+    through = jnp.einsum("tiab,tibc->tac", weights, own)
+    grown = parameters.slopes(w, model, path.inputs, weights)
+    if columns.size:
+        coupling = A[..., observed:].reshape(*A.shape[:3], -1, 2)
+        by_pair = jnp.einsum("tiab,tibkc,tikcq->takq", weights, coupling, path.pairs)
+        grown = grown.at[..., columns].add(by_pair)
+    return free[..., None] * jnp.eye(observed) + through, grown
+
+
+class _Path(NamedTuple):
+    """A rollout with what happens at the four stages of each step.
+
+    Attributes
+    ----------
+    states
+        At the ends of the steps, ``(step, state)``.
+    free
+        1 where a state was not held at the end of its range there, else 0; same shape.
+    inputs
+        I at the stages, ``(step, stage, input)``.
+    pairs
+        Slopes of the latent pairs at the stages, ``(step, stage, pair, 2, own)``.
+    """
+
+    states: jax.Array
+    free: jax.Array
+    inputs: jax.Array
+    pairs: jax.Array
+
+
+def _path(
+    parameters: Parametrization,
+    plain: DFSM,
+    step: float,
+    x0: jax.Array,
+    pairs0: jax.Array,
+    v: jax.Array,
+) -> _Path:
+    """March states and latent slopes; arguments as for `sensitivities`, `plain` is the model."""
+    model, dynamics = plain.prepared(), poles(plain)
+    low, high = clip_range(model, FAR)
+    observed = len(plain.signals.observed)
+    M = jnp.stack([-dynamics.decay, dynamics.frequency, -dynamics.frequency, -dynamics.decay])
+    M = M.T.reshape(-1, 2, 2)
+
+    def slope(at: _At, v: jax.Array) -> tuple[_At, jax.Array]:
+        x, P = at
+        inputs = model.join(x, *exogenous_groups(model, v))
+        grown = M @ P + parameters.latent_slopes(plain, inputs) if P.size else P
+        return (rate(model, x, v), grown), inputs
+
+    def advance(at: _At, drive: tuple[jax.Array, ...]) -> tuple[_At, _Path]:
+        v0, vm, v1 = drive
+        stages = [at]
+        k1, i1 = slope(stages[0], v0)
+        stages.append(_moved(at, k1, step / 2))
+        k2, i2 = slope(stages[1], vm)
+        stages.append(_moved(at, k2, step / 2))
+        k3, i3 = slope(stages[2], vm)
+        stages.append(_moved(at, k3, step))
+        k4, i4 = slope(stages[3], v1)
+        total = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+        x, P = _moved(at, total, step)
+        held = jnp.clip(x, low, high)
+        free = jnp.where(held == x, 1.0, 0.0)
+        P = P * free[observed:].reshape(-1, 2)[..., None]
+        pairs = jnp.stack([s[1] for s in stages])
+        return (held, P), _Path(held, free, jnp.stack([i1, i2, i3, i4]), pairs)
+
+    return jax.lax.scan(advance, (x0, pairs0), (v[:-2:2], v[1::2], v[2::2]))[1]
+
+
+def _moved(at: _At, k: _At, dt: float) -> _At:
+    return at[0] + dt * k[0], at[1] + dt * k[1]
+
+
+def _state_matrix(model: DFSM, inputs: jax.Array) -> jax.Array:
+    """∂f̂/∂ξ of the observed states at one input vector, ``(observed state, state)``."""
+    x, *others = model.split(inputs)
+    observed = len(model.signals.observed)
+    return jax.jacrev(lambda x: model.derivative(x, *others)[:observed])(x)
+
+
+def _stage_weights(A: jax.Array, h: float) -> jax.Array:
+    """How what is added to dS/dt at each of the four stages of a step enters S at its end.
+
+    Parameters
+    ----------
+    A
+        ∂f̂/∂ξ at the stages, ``(step, stage, state, state)``.
+    h
+        Length of the steps in s.
+
+    Returns
+    -------
+    Array
+        Matrices of the same shape; from unrolling the classical Runge-Kutta step.
+    """
+    _, A2, A3, A4 = (A[:, i] for i in range(4))
+    one = jnp.broadcast_to(jnp.eye(A.shape[-1]), A2.shape)
+    w3 = 2 * one + h * A4
+    w2 = 2 * one + h / 2 * w3 @ A3
+    w1 = one + h / 2 * w2 @ A2
+    return h / 6 * jnp.stack([w1, w2, w3, one], axis=1)

@@ -1,0 +1,134 @@
+"""What refinement adds to a model, and where the learning of it starts.
+
+Latent states: poles over a range. What a linear fit of the derivatives leaves over is regressed on
+the inputs filtered by each pole; the best single drive per pole is the leading singular pair of
+those coefficients. A network: directions drawn at random, and nothing added to the derivatives yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.models.corrective import Perceptron, ignoring
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import Poles, add_latents, as_states
+from dfsm.refinement.parameters import Parametrization
+from dfsm.refinement.rollout_error import Record
+
+# Poles lie between a thirtieth of the records and some steps of the refinement.
+_SLOWEST, _FASTEST = 30.0, 7.0
+_RIDGE = 1e-2
+
+
+def start_latents(
+    model: DFSM,
+    records: Sequence[Record],
+    count: int,
+    spread: Array,
+    drivers: Sequence[str] | None = None,
+) -> DFSM:
+    """Add latent states that explain some of what the model's derivatives leave over.
+
+    Parameters
+    ----------
+    model
+        Has none.
+    records
+        Training runs.
+    count
+        How many, an even number: they come in damped pairs.
+    spread
+        Typical size of the observed states' derivatives, shape ``(state,)``.
+    drivers
+        Controls and disturbances that drive them; None takes all.
+
+    Returns
+    -------
+    DFSM
+        Each pair moves by about one standard deviation.
+    """
+    s, region = model.signals, model.region
+    pairs, n_uw = count // 2, len(s.driving)
+    longest = max((len(r.states) - 1) * r.step for r in records)
+    decay = np.geomspace(_SLOWEST / longest, 1 / (_FASTEST * records[0].step), pairs)
+    rows = list(Parametrization.of(model, spread).rows)
+    left = np.concatenate([r.left_over(model)[:, rows] / spread[rows] for r in records])
+
+    std = np.asarray(region.scale)[:n_uw]
+    names = [c.name for c in s.inputs[:n_uw]]
+    columns = [i for i, n in enumerate(names) if drivers is None or n in drivers]
+    each = np.repeat(decay, len(columns))
+    drive = np.tile(np.diag(1 / std)[columns], (pairs, 1)) * each[:, None]
+    middle = np.asarray(region.mean)[:n_uw]
+    filters = _poles(each, drive, middle)
+    filtered = np.concatenate([r.follow(filters)[r.before :] for r in records])
+    coefficients = _regress(filtered, left).reshape(len(rows), pairs, len(columns))
+    drives = np.zeros((pairs, n_uw), dtype=complex)
+    for k in range(pairs):
+        best = np.linalg.svd(coefficients[:, k], full_matrices=False)[2][0]
+        drives[k, columns] = best * decay[k] / std[columns]
+    paths = np.concatenate([r.follow(_poles(decay, drives, middle)) for r in records])
+    drives /= np.sqrt(np.mean(np.abs(paths) ** 2, axis=0) / 2)[:, None]
+    found = _poles(decay, drives, middle)
+    pairs_along = [r.follow(found)[r.before :] for r in records]
+    c = _regress(np.concatenate(pairs_along), left)
+    coupling = np.zeros((len(s.states), count))
+    # Re(c ζ) in terms of the real states Re ζ and Im ζ.
+    both = np.stack([c.real, -c.imag], axis=2).reshape(len(rows), count)
+    coupling[rows] = both * spread[rows, None]
+    along = [np.asarray(as_states(jnp.asarray(z))) for z in pairs_along]
+    return add_latents(model, found, coupling, along)
+
+
+def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
+    """Add a tanh network to a derivative function that nothing corrects.
+
+    Parameters
+    ----------
+    model
+        Has no corrective function.
+    hidden
+        Number of units.
+    spread
+        Typical size of the observed states' derivatives, shape ``(state,)``.
+    seed
+        Draws the directions.
+
+    Returns
+    -------
+    DFSM
+        Predicts what it did before. Inputs whose effect physics gave are hidden from the network.
+    """
+    rows = Parametrization.of(model, spread).rows
+    rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
+    directions = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
+    network = Perceptron(
+        shift=region.mean,
+        scale=region.scale,
+        weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
+        biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
+    )
+    function = ignoring(network, model.f.known_inputs)
+    return replace(model, e=function, corrected=rows)
+
+
+def _poles(decay: Array, drive: Array, middle: Array) -> Poles:
+    """Poles at 45 degrees, at rest under the mean inputs."""
+    b = jnp.asarray(drive, dtype=complex)
+    return Poles(jnp.asarray(decay), jnp.asarray(decay), b, -b @ middle)
+
+
+def _regress(paths: Array, targets: Array) -> Array:
+    """Complex m with targets = Re(paths mᵀ), ridge regression; shape ``(target, path)``."""
+    X = np.concatenate([paths.real, -paths.imag], axis=1)
+    scale = np.sqrt(np.mean(X**2, axis=0))
+    Z = X / scale
+    Q = Z.T @ Z / len(Z) + _RIDGE * np.eye(Z.shape[1])
+    c = np.linalg.solve(Q, Z.T @ targets / len(Z)) / scale[:, None]
+    n = paths.shape[1]
+    return (c[:n] + 1j * c[n:]).T

@@ -1,0 +1,109 @@
+"""A solution of any optimal control problem as a page: how it ended, and every signal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dfsm.control.solution import Solution
+from dfsm.data.trajectory import Role
+from dfsm.report.article import Article, Section, Table
+from dfsm.report.article_page import write_article
+from dfsm.report.control_figures import stacked_figure
+
+# In the order drawn: what comes from outside, what is chosen, what follows.
+_ROLES: tuple[Role, ...] = ("disturbance", "control", "state", "output")
+
+
+def write_solution_report(solution: Solution, path: str | Path) -> None:
+    """Write one self-contained HTML page about a solution.
+
+    Parameters
+    ----------
+    solution
+        From `solve`, also one that did not succeed.
+    path
+        File to write; an existing one is replaced when the new one is complete.
+
+    Raises
+    ------
+    DfsmError
+        The file cannot be written.
+    """
+    write_article(solution_article(solution), path)
+
+
+def solution_article(solution: Solution) -> Article:
+    """Put a solution into tables and figures.
+
+    Parameters
+    ----------
+    solution
+        From `solve`.
+    """
+    count = len(solution.trajectories)
+    return Article(
+        key="solution",
+        title=solution.name,
+        lede=solution.message[:1].upper() + solution.message[1:] + ".",
+        sections=(
+            Section("outcome", "Outcome", tables=(_outcome(solution),)),
+            *[_scenario(solution, k, count) for k in range(count)],
+        ),
+    )
+
+
+def _outcome(s: Solution) -> Table:
+    time = s.trajectory.time
+    rows: list[tuple[str, str | float | None]] = [
+        ("ended", s.ending.name.lower().replace("_", " ")),
+        ("objective", s.objective),
+        ("of which final cost", s.final_cost),
+        ("of which integral", s.integral_cost),
+        ("first time (s)", float(time[0])),
+        ("last time (s)", float(time[-1])),
+        *[(f"parameter {name}", value) for name, value in s.parameters.items()],
+        (f"intervals ({s.grid.kind.replace('_', '–')})", s.grid.intervals),
+        ("largest local error", s.error),
+        ("largest violation of a constraint, relative", s.violation),
+        ("iterations", s.iterations),
+        ("time to compile (s)", s.seconds["compile"]),
+        ("time to solve (s)", s.seconds["solve"]),
+    ]
+    if s.outside is not None:
+        rows.append(("outside the training range (% of the horizon)", 100 * s.outside))
+    return Table("outcome", "How the solve ended", ("what", "value"), tuple(rows), digits=6)
+
+
+def _scenario(s: Solution, k: int, count: int) -> Section:
+    run = s.trajectories[k]
+    names = [c.name for role in _ROLES for c in run.channels if c.role == role]
+    rows = tuple(
+        (
+            f"{name} ({run.channel(name).unit})" if run.channel(name).unit else name,
+            run.channel(name).role,
+            *map(float, (run[name].min(), run[name].mean(), run[name].max())),
+            s.replays[k].deviation.get(name) if s.replays else None,
+        )
+        for name in names
+    )
+    table = Table(
+        f"signals_{k + 1}",
+        "All signals at the nodes",
+        ("signal", "role", "least", "mean", "most", "replay, off by"),
+        rows,
+        note=(
+            "Replay: the optimal controls in an adaptive integrator, from the optimal initial "
+            "state, with all samples of the disturbances."
+        ),
+        digits=5,
+    )
+    label = f"scenario {k + 1}" if count > 1 else "optimum"
+    figure = stacked_figure(
+        f"course_{k + 1}",
+        "Disturbances, controls, states and outputs. Dashed: bounds near enough to be shown.",
+        {label: s},
+        names,
+        scenario=k,
+    )
+    heading = f"Scenario {k + 1}: {run.name}" if count > 1 else "Signals"
+    return Section(f"scenario-{k + 1}", heading, tables=(table,), figures=(figure,))

@@ -1,0 +1,339 @@
+"""The integrators behind `simulate`: a batched RK4 scan, and diffrax's adaptive solvers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+from dfsm.models.dfsm import DFSM
+
+# Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
+_PAD = 1000
+_MAX_STEPS = 1_000_000
+# Fixed steps of one run, whose inputs and states are all held in memory.
+_MOST_STEPS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Times to integrate over and the inputs there.
+
+    Attributes
+    ----------
+    time
+        Ends and middles of all steps in s, shape ``(2 step + 1,)``.
+    inputs
+        Controls, disturbances and parameters at those times, ``(2 step + 1, exogenous)``.
+    every
+        Steps per sample of the run.
+    """
+
+    time: Array
+    inputs: Array
+    every: int
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return len(self.time) // 2
+
+
+@dataclass(frozen=True)
+class Case:
+    """Where a rollout starts and what drives it.
+
+    Attributes
+    ----------
+    mesh
+        Times and inputs.
+    x0
+        Initial states ``(state,)``.
+    psi0
+        Initial azimuth in rad.
+    """
+
+    mesh: Mesh
+    x0: Array
+    psi0: float
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout gives at the run's samples.
+
+    Attributes
+    ----------
+    states, outputs
+        Shapes ``(sample, state)`` and ``(sample, output)``.
+    outside
+        Whether any input is outside its training range, ``(sample,)``.
+    solved
+        Whether the solver reached the end.
+    """
+
+    states: Array
+    outputs: Array
+    outside: Array
+    solved: bool
+
+
+def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
+    """Divide the intervals between samples into steps and interpolate the inputs.
+
+    Parameters
+    ----------
+    driven
+        The exogenous channels of one run.
+    step
+        Largest step in s; None makes one step per sample.
+    interpolation
+        ``"linear"`` or ``"cubic"`` spline.
+
+    Raises
+    ------
+    DfsmError
+        So small a step that the inputs along it would fill the memory.
+    """
+    longest, intervals = float(np.diff(driven.time).max()), len(driven) - 1
+    parts = 1.0 if step is None else longest / step * (1 - 1e-9)
+    if parts > 1 and parts * intervals > _MOST_STEPS:
+        # A little more than the smallest, so that the rounded figure is allowed too.
+        least = 1.01 * longest / max(1, _MOST_STEPS // intervals)
+        raise DfsmError(
+            f"{driven.where}: steps of {step:g} s over {driven.duration:g} s make "
+            f"{parts * intervals:.3g} steps, at most {_MOST_STEPS:,} are allowed: choose a step "
+            f"of at least {least:.3g} s, or a shorter time window"
+        )
+    every = max(1, int(np.ceil(parts)))
+    parts = np.arange(2 * every) / (2 * every)
+    time = _between(driven.time[:, None], parts)[:, 0]
+    if interpolation == "cubic":
+        inputs = CubicSpline(driven.time, driven.values)(time)
+    else:
+        inputs = _between(driven.values, parts)
+    return Mesh(time, inputs, every)
+
+
+def _between(values: Array, parts: Array) -> Array:
+    """Values at fractions of every interval between rows, and the last row."""
+    steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
+    return np.concatenate(
+        [(values[:-1, None, :] + steps).reshape(-1, values.shape[1]), values[-1:]]
+    )
+
+
+# -- fixed steps --------------------------------------------------------------------------------
+
+
+def march(model: DFSM, cases: Iterable[Case]) -> Iterator[Rollout]:
+    """Classical RK4, one thread per processor; an accelerator takes all runs in one batch.
+
+    On a processor XLA keeps a loop on one core, and a single run stays in its cache where a batch
+    does not. Runs are marched while the next are being prepared.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    cases
+        One per run, consumed in order; lengths may differ.
+
+    Yields
+    ------
+    Rollout
+        In the order of `cases`.
+    """
+    if jax.default_backend() != "cpu":
+        yield from _march_batch(model, list(cases))
+        return
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for rollouts in pool.map(lambda case: _march_batch(model, [case]), cases):
+            yield from rollouts
+
+
+def _march_batch(model: DFSM, cases: Sequence[Case]) -> list[Rollout]:
+    padded = -(-max(c.mesh.steps for c in cases) // _PAD) * _PAD
+    h = np.zeros((len(cases), padded))
+    inputs = np.zeros((len(cases), 2 * padded + 1, cases[0].mesh.inputs.shape[1]))
+    for i, m in enumerate(c.mesh for c in cases):
+        h[i, : m.steps] = np.diff(m.time[::2])
+        inputs[i, : len(m.time)] = m.inputs
+        inputs[i, len(m.time) :] = m.inputs[-1]
+    x0, psi0 = np.stack([c.x0 for c in cases]), np.array([c.psi0 for c in cases])
+    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, inputs))
+    rollouts = []
+    for i, m in enumerate(c.mesh for c in cases):
+        rows = slice(0, m.steps + 1, m.every)
+        rollouts.append(Rollout(states[i, rows], outputs[i, rows], outside[i, rows], True))
+    return rollouts
+
+
+@eqx.filter_jit
+def _march(
+    model: DFSM, x0: Array, psi0: Array, h: Array, inputs: Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    model = model.prepared()
+
+    def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
+        return rk4(model, x0, h, v)
+
+    xs = jax.vmap(states)(*map(jnp.asarray, (x0, h, inputs)))
+    seen = _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
+    return xs, *seen
+
+
+def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = np.inf) -> jax.Array:
+    """Classical RK4 over given steps; JAX can follow it.
+
+    Parameters
+    ----------
+    model
+        The surrogate, best `prepared`.
+    x0
+        Initial states ``(state,)``.
+    h
+        Steps in s ``(step,)``; a step of zero changes nothing.
+    v
+        Exogenous inputs at ends and middles of the steps ``(2 step + 1, exogenous)``.
+    bound
+        States are held within this many training half-ranges of the range's middle.
+
+    Returns
+    -------
+    Array
+        States at the ends of all steps, ``(step + 1, state)``.
+    """
+    low, high = clip_range(model, bound)
+
+    def step(x: jax.Array, drive: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        dt, v0, vm, v1 = drive
+        k1 = rate(model, x, v0)
+        k2 = rate(model, x + 0.5 * dt * k1, vm)
+        k3 = rate(model, x + 0.5 * dt * k2, vm)
+        k4 = rate(model, x + dt * k3, v1)
+        x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        if np.isfinite(bound):
+            x = jnp.clip(x, low, high)
+        return x, x
+
+    _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
+    return jnp.concatenate([x0[None], xs])
+
+
+def clip_range(model: DFSM, bound: float) -> tuple[jax.Array, jax.Array]:
+    """Lowest and highest states within `bound` training half-ranges of the range's middle."""
+    columns = model.signals.state_columns
+    low, high = model.region.low[columns], model.region.high[columns]
+    middle, reach = (low + high) / 2, (high - low) / 2 * bound
+    return middle - reach, middle + reach
+
+
+def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Controls, disturbances and parameters in a vector of exogenous inputs."""
+    n_u, n_w = len(model.signals.controls), len(model.signals.disturbances)
+    return v[..., :n_u], v[..., n_u : n_u + n_w], v[..., n_u + n_w :]
+
+
+def rate(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
+    """f̂ at states ``(state,)`` and exogenous inputs ``(exogenous,)``."""
+    return model.derivative(x, *exogenous_groups(model, v))
+
+
+def _observe(
+    model: DFSM, h: jax.Array, xs: jax.Array, v: jax.Array, psi0: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Outputs along rollouts ``(..., time, n)`` and whether any input is outside its range.
+
+    The azimuth is the integral of the rollout's own speed.
+    """
+    turn, psi = model.signals.azimuth_rate, None
+    if turn is not None:
+        omega = turn[1] * xs[..., turn[0]]
+        angle = jnp.cumsum(0.5 * h * (omega[..., 1:] + omega[..., :-1]), axis=-1)
+        psi = psi0[..., None] + jnp.concatenate([jnp.zeros_like(omega[..., :1]), angle], axis=-1)
+    groups = exogenous_groups(model, v)
+    return model.output(xs, *groups, psi), model.region.outside(model.join(xs, *groups))
+
+
+# -- adaptive steps -----------------------------------------------------------------------------
+
+
+def adapt(model: DFSM, case: Case, method: str, tolerances: tuple[float, float]) -> Rollout:
+    """Integrate one run with diffrax.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    case
+        The inputs vary linearly between the points of its mesh.
+    method
+        ``"tsit5"`` or ``"kvaerno5"`` (stiff).
+    tolerances
+        Relative, and absolute in standard deviations of each state.
+    """
+    mesh = case.mesh
+    # Tolerances as arrays: a Python number would be compiled in, and another compile again.
+    rtol, atol = map(jnp.asarray, tolerances)
+    states, outputs, outside, solved = _adapt(
+        model,
+        mesh.time,
+        mesh.inputs,
+        jnp.asarray(case.x0),
+        jnp.asarray(case.psi0),
+        rtol,
+        atol,
+        method=method,
+        every=mesh.every,
+    )
+    return Rollout(np.asarray(states), np.asarray(outputs), np.asarray(outside), bool(solved))
+
+
+@eqx.filter_jit
+def _adapt(
+    model: DFSM,
+    time: Array,
+    inputs: Array,
+    x0: jax.Array,
+    psi0: jax.Array,
+    rtol: jax.Array,
+    atol: jax.Array,
+    *,
+    method: str,
+    every: int,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    import diffrax
+
+    path = diffrax.LinearInterpolation(jnp.asarray(time), jnp.asarray(inputs))
+    spread = model.region.std[model.signals.state_columns]
+    spread = jnp.where(spread > 0, spread, 1.0)
+    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, path.evaluate(t)) / spread)
+    samples = jnp.asarray(time[:: 2 * every])
+    solution = diffrax.diffeqsolve(
+        term,
+        diffrax.Tsit5() if method == "tsit5" else diffrax.Kvaerno5(),
+        t0=samples[0],
+        t1=samples[-1],
+        dt0=None,
+        # Scaled by their spread all states share one absolute tolerance.
+        y0=x0 / spread,
+        saveat=diffrax.SaveAt(ts=samples),
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    states = jnp.asarray(solution.ys) * spread
+    v = jnp.asarray(inputs[:: 2 * every])
+    outputs, outside = _observe(model, jnp.diff(samples), states, v, psi0)
+    return states, outputs, outside, solution.result == diffrax.RESULTS.successful

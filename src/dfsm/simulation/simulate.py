@@ -1,0 +1,350 @@
+"""Time marching of a surrogate: fixed-step RK4, or diffrax's adaptive and stiff solvers.
+
+A rollout is driven by controls, disturbances, parameters and the initial state, nothing else.
+"""
+
+from __future__ import annotations
+
+import enum
+import time as clock
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dfsm.core.renamed import renamed
+from dfsm.core.settings import settings_class
+from dfsm.core.types import Array
+from dfsm.data.derivatives import differentiate
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError, DfsmWarning, printable
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import latent_state
+from dfsm.models.signals import require_constant, with_computed
+from dfsm.simulation.integrate import Case, Rollout, adapt, march, mesh_of
+
+# A rollout ends where a state is this many times its training half-range from the middle.
+_ESCAPE = 10.0
+# Share of the time outside the training range above which a user is warned.
+MUCH_OUTSIDE = 0.05
+# Rates at the start are taken from this much of the record before it (or, where the record starts
+# there, just after it): long enough for a derivative, too short to leak a response.
+_HISTORY = 5.0
+_HISTORY_SAMPLES = 100
+_HEAD = 1.0
+_HEAD_SAMPLES = 20
+
+
+Method = Literal["rk4", "tsit5", "kvaerno5"]
+METHODS: tuple[str, ...] = get_args(Method)
+
+
+@settings_class
+class SimulationSettings:
+    """How to march in time.
+
+    Attributes
+    ----------
+    method
+        ``"rk4"``: classical Runge-Kutta with fixed steps. ``"tsit5"``: adaptive explicit
+        (Tsitouras 2011). ``"kvaerno5"``: adaptive, for stiff models (Kværnø 2004).
+    step
+        Largest step of ``"rk4"`` in s; None takes the run's own samples.
+    rtol, atol
+        Tolerances of the adaptive methods; `atol` is relative to each state's training spread.
+    interpolation
+        Inputs between samples: ``"linear"`` or ``"cubic"`` spline.
+    """
+
+    method: Method = "rk4"
+    step: float | None = None
+    rtol: float = 1e-6
+    atol: float = 1e-8
+    interpolation: Literal["linear", "cubic"] = "linear"
+
+    def __post_init__(self) -> None:
+        if self.step is not None and not self.step > 0:
+            raise DfsmError(f"the simulation step is {self.step} s, expected more than 0")
+
+
+class Status(enum.Enum):
+    """How a simulation ended; the value says what it means and what to do."""
+
+    COMPLETED = "completed"
+    LEFT_REGION = (
+        "stopped where a state left the training range by a factor of ten: the model is unstable "
+        "there; look at its eigenvalues, or train on runs that cover this case"
+    )
+    NOT_FINITE = (
+        "stopped where a state was no longer finite: use a smaller step or a stiff method, and "
+        "look at the model's eigenvalues"
+    )
+    SOLVER_FAILED = (
+        "the adaptive solver gave up: loosen rtol and atol, use kvaerno5 for a stiff model, or rk4"
+    )
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A rollout.
+
+    Attributes
+    ----------
+    trajectory
+        States and outputs on the run's time mesh, up to where the rollout ended; roles are set.
+    status
+        How it ended.
+    ended
+        Last time in s.
+    reason
+        For a rollout that did not complete, the state that left the range and where; else "".
+    outside
+        Share of the samples with any input outside its training range.
+    wall_time
+        Seconds it took (of the whole batch divided by its runs), without compilation when warm.
+    """
+
+    trajectory: Trajectory
+    status: Status
+    ended: float
+    reason: str
+    outside: float
+    wall_time: float = 0.0
+
+    def __repr__(self) -> str:
+        run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
+        return (
+            f"<Simulation of {printable(run.name)}: {outcome}, {run.time[0]:g} to "
+            f"{self.ended:g} s, {len(run)} samples; {printable(self.message)}>"
+        )
+
+    @property
+    def message(self) -> str:
+        """One sentence on the outcome."""
+        if self.status is Status.COMPLETED:
+            return f"{self.outside:.1%} of the time outside the training range"
+        return f"{self.reason}; {self.status.value}"
+
+
+@overload
+def simulate(
+    model: DFSM,
+    runs: Trajectory,
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    initial: ArrayLike | None = None,
+    settings: SimulationSettings | None = None,
+) -> Simulation: ...
+@overload
+def simulate(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    initial: ArrayLike | None = None,
+    settings: SimulationSettings | None = None,
+) -> list[Simulation]: ...
+@renamed(options="settings")
+def simulate(
+    model: DFSM,
+    runs: Trajectory | Sequence[Trajectory],
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    initial: ArrayLike | None = None,
+    settings: SimulationSettings | None = None,
+) -> Simulation | list[Simulation]:
+    """Simulate a surrogate with the inputs of one run, or of many at once.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    runs
+        Trajectories that hold the model's controls, disturbances and parameters, and its measured
+        states unless `initial` is given. Samples before `start` serve only to find the initial
+        rates.
+    start, stop
+        Time window in s; None leaves that end open.
+    initial
+        Initial states, shape ``(state,)`` or one row per run, all of them or all but the latent
+        ones; None takes the recorded state at `start`. Latent states follow from the inputs
+        recorded before `start`.
+    settings
+        Integration method and steps.
+
+    Returns
+    -------
+    Simulation or list of Simulation
+        In the order of `runs`.
+
+    Raises
+    ------
+    DfsmError
+        A channel is missing or not finite, a parameter varies within a run, the window is too
+        short, or the step too small for it.
+
+    Warns
+    -----
+    DfsmWarning
+        A rollout was outside the training range for part of the time, or ended early.
+    """
+    settings = settings or SimulationSettings()
+    single = isinstance(runs, Trajectory)
+    batch = [runs] if isinstance(runs, Trajectory) else list(runs)
+    batch = [with_computed(r, model.signals.hub_height, model.signals.features) for r in batch]
+    if not batch:
+        raise DfsmError("no runs were given to simulate")
+    names = model.signals.exogenous
+    for run in batch:
+        run.columns((*names, *(model.signals.measured if initial is None else ())))
+    driven = [r.select(names).window(start, stop).require_finite() for r in batch]
+    for run in driven:
+        require_constant(run, model.signals.names("parameters"))
+    given = None if initial is None else _given(model, initial, len(batch))
+
+    def case(i: int) -> Case:
+        begins = float(driven[i].time[0])
+        x0 = _observed_state(model, batch[i], begins) if given is None else given[i]
+        if len(x0) < len(model.signals.states):
+            x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
+        mesh = mesh_of(driven[i], settings.step, settings.interpolation)
+        return Case(mesh, x0, _initial_azimuth(model, batch[i], begins))
+
+    begin = clock.perf_counter()
+    cases = map(case, range(len(batch)))
+    if settings.method == "rk4":
+        solved = march(model, cases)
+    else:
+        tolerances = (settings.rtol, settings.atol)
+        solved = (adapt(model, c, settings.method, tolerances) for c in cases)
+    results = [
+        _result(model, r, d, rollout) for r, d, rollout in zip(batch, driven, solved, strict=True)
+    ]
+    wall = (clock.perf_counter() - begin) / len(batch)
+    results = [replace(r, wall_time=wall) for r in results]
+    _warn(results)
+    return results[0] if single else results
+
+
+def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
+    """Recorded state at `start`; rates come from samples up to it, never from the response after.
+
+    Parameters
+    ----------
+    model
+        The surrogate, for its states and its way of taking derivatives.
+    run
+        Holds the measured states, and for latent states controls and disturbances.
+    start
+        Time in s. Where the record begins there, the first second of it gives the rates.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(state,)``.
+    """
+    latent = latent_state(model, run, start)
+    return np.concatenate([_observed_state(model, run, start), latent])
+
+
+def _given(model: DFSM, initial: ArrayLike, runs: int) -> Array:
+    """Initial states of every run as given, ``(run, state)``, with the latent ones or without."""
+    given, s = np.asarray(initial, dtype=np.float64), model.signals
+    lengths = (len(s.states), len(s.observed)) if s.latents else (len(s.states),)
+    shapes = [shape for n in lengths for shape in ((n,), (runs, n))]
+    if given.shape not in shapes:
+        raise DfsmError(
+            f"initial has shape {given.shape}, expected {' or '.join(map(str, shapes))}"
+        )
+    return np.broadcast_to(given, (runs, given.shape[-1]))
+
+
+def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
+    s = model.signals
+    measured = [n for spec in s.specs for n in (spec.name, spec.rate) if n is not None]
+    specs = [replace(spec, acceleration=None) for spec in s.specs]
+    run = run.select(dict.fromkeys(measured))
+    if all(spec.order == 1 or spec.rate for spec in specs):
+        index = int(np.argmin(np.abs(run.time - start)))
+        # Two samples make a trajectory, whose check says which channel is not finite and when.
+        near = slice(max(0, index - 1), index + 1) if index else slice(0, 2)
+        replace(run, time=run.time[near], values=run.values[near]).require_finite()
+        values = dict(zip(run.names, run.values[index], strict=True))
+        rates = [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
+        return np.array([values[spec.name] for spec in specs] + rates)
+    now = int(np.searchsorted(run.time, start, side="right"))
+    if now >= _HEAD_SAMPLES:
+        first = min(start - _HISTORY, float(run.time[max(0, now - _HISTORY_SAMPLES)]))
+        piece, row = run.window(first, start), -1
+    else:
+        head = max(start + _HEAD, float(run.time[min(len(run), _HEAD_SAMPLES) - 1]))
+        piece, row = run.window(start, head), 0
+    found = differentiate(piece.require_finite(), specs, s.derivatives)
+    return found.trajectory.select(found.names).values[row]
+
+
+def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
+    azimuth = model.signals.azimuth
+    if azimuth is None or azimuth.angle is None or azimuth.angle not in run:
+        return 0.0
+    return float(np.deg2rad(run[azimuth.angle][int(np.argmin(np.abs(run.time - start)))]))
+
+
+# -- judging the outcome ------------------------------------------------------------------------
+
+
+def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) -> Simulation:
+    s = model.signals
+    columns = s.state_columns
+    low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
+    middle, half = (low + high) / 2, (high - low) / 2
+    x = rollout.states
+    finite = np.isfinite(x)
+    escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > _ESCAPE * half)
+    rows = np.flatnonzero(escaped.any(axis=1))
+    end = int(rows[0]) if len(rows) else len(x)
+    status, reason = Status.COMPLETED, ""
+    # An adaptive solver that gives up leaves the samples beyond without a value.
+    if not rollout.solved and (end == len(x) or not finite[end].all()):
+        status, reason = Status.SOLVER_FAILED, f"no solution beyond {driven.time[end - 1]:g} s"
+    elif len(rows):
+        column = int(np.flatnonzero(escaped[end])[0])
+        status = Status.LEFT_REGION if finite[end].all() else Status.NOT_FINITE
+        reason = (
+            f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
+            f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
+        )
+        # The sample where it left shows which way the model went.
+        end += status is Status.LEFT_REGION
+    values = np.concatenate([x, rollout.outputs], axis=1)[: max(2, end)]
+    values[end:] = np.nan  # a trajectory has two samples, even if the first step failed
+    channels = (*s.states, *s.outputs)
+    time = driven.time[: len(values)]
+    return Simulation(
+        trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
+        status=status,
+        ended=float(time[end - 1]),
+        reason=reason,
+        outside=float(rollout.outside[:end].mean()),
+    )
+
+
+def _warn(results: Sequence[Simulation]) -> None:
+    ended = [r for r in results if r.status is not Status.COMPLETED]
+    for r in ended:
+        warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=3)
+    outside = [r for r in results if r.status is Status.COMPLETED and r.outside > MUCH_OUTSIDE]
+    if outside:
+        worst = max(outside, key=lambda r: r.outside)
+        warnings.warn(
+            f"{len(outside)} of {len(results)} rollouts spend more than {MUCH_OUTSIDE:.0%} of the "
+            f"time outside the training range, {worst.trajectory.name} most ({worst.outside:.1%})",
+            DfsmWarning,
+            stacklevel=3,
+        )

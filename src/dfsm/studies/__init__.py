@@ -1,1 +1,0 @@
-"""Studies of the method on systems whose equations are known, so that its errors are too."""

@@ -1,0 +1,315 @@
+"""What a validation finds: models against recorded runs, and the figures of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dfsm.core.files import json_value
+from dfsm.core.types import Array, ComplexArray
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.errors import printable
+from dfsm.models.dfsm import DFSM
+from dfsm.numerics.spectra import Spectrum
+from dfsm.simulation.simulate import MUCH_OUTSIDE, Simulation, Status
+from dfsm.validation.intervals import Intervals
+
+# The model that prediction intervals belong to, among those compared.
+MULTI_FIDELITY = "multi-fidelity"
+
+
+@dataclass(frozen=True)
+class ChannelStatistics:
+    """One signal of one run: figures that stand on their own, without a comparison.
+
+    Attributes
+    ----------
+    minimum, mean, maximum, std
+        In the channel's unit.
+    peaks
+        Peak frequency in Hz per band; None where the band holds no bin.
+    power
+        Variance per band in the unit squared; band ``0-0.3 Hz`` is always there.
+    damage
+        1 Hz damage-equivalent load per Wöhler exponent, outputs only.
+    spectrum
+        Welch's power spectral density.
+    """
+
+    minimum: float
+    mean: float
+    maximum: float
+    std: float
+    peaks: Mapping[str, float | None]
+    power: Mapping[str, float]
+    damage: Mapping[str, float]
+    spectrum: Spectrum
+
+
+@dataclass(frozen=True)
+class ChannelError:
+    """Error of a simulated signal against the recorded one.
+
+    Attributes
+    ----------
+    rmse, maximum
+        In the channel's unit.
+    nrmse
+        RMSE divided by the standard deviation of the recorded signal; infinite for a constant.
+    """
+
+    rmse: float
+    nrmse: float
+    maximum: float
+
+    @classmethod
+    def of(cls, simulated: Array, recorded: Array) -> ChannelError:
+        """Compare samples at the same times."""
+        difference, size = simulated - recorded, spread(recorded)
+        rmse = float(np.sqrt(np.mean(difference**2)))
+        return cls(rmse, rmse / size if size else float("inf"), float(np.abs(difference).max()))
+
+
+def spread(values: Array) -> float:
+    """Standard deviation; 0 for a constant, whose samples differ by rounding errors only."""
+    std = float(values.std())
+    return std if std > 1e-12 * np.abs(values).max() else 0.0
+
+
+@dataclass(frozen=True)
+class ModelRun:
+    """One model on one test run.
+
+    Attributes
+    ----------
+    simulation
+        The rollout.
+    errors, statistics
+        Per channel; empty for a rollout that ended early, whose figures would flatter it.
+    derivative_errors
+        NRMSE of each state derivative along the recorded trajectory, by state name.
+    band, coverage
+        Lower and upper ends of prediction intervals, and per channel the share of the time that
+        the record lies between them; only where intervals were given and the rollout completed.
+    """
+
+    simulation: Simulation
+    errors: Mapping[str, ChannelError]
+    statistics: Mapping[str, ChannelStatistics]
+    derivative_errors: Mapping[str, float]
+    band: tuple[Trajectory, Trajectory] | None = None
+    coverage: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """A test run and what every model made of it.
+
+    Attributes
+    ----------
+    recorded
+        The recorded states (smoothed as in the fit) and outputs in the test window.
+    statistics
+        Of the recorded channels.
+    models
+        By model name.
+    parameters
+        Values of the models' parameters in this run, in the channels' units.
+    """
+
+    recorded: Trajectory
+    statistics: Mapping[str, ChannelStatistics]
+    models: Mapping[str, ModelRun]
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Pointwise errors of one channel over all test runs: counts between `edges`."""
+
+    edges: Array
+    counts: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Everything that a report shows.
+
+    Attributes
+    ----------
+    models
+        The models compared, by name, in the order shown.
+    channels
+        States and outputs, in the order shown.
+    runs
+        Test runs in the order given.
+    histograms
+        Per channel, over the runs that all models completed which completed any.
+    eigenvalues
+        Of the linear fit, per schedule point.
+    record
+        Provenance of the model: settings, data, rows, seconds.
+    warnings
+        What a reader should know before trusting the figures.
+    intervals
+        Prediction intervals of the multi-fidelity model, if given.
+    """
+
+    models: Mapping[str, DFSM]
+    channels: tuple[Channel, ...]
+    runs: tuple[RunComparison, ...]
+    histograms: Mapping[str, Histogram]
+    eigenvalues: Sequence[tuple[float, ComplexArray]]
+    record: Mapping[str, Any]
+    warnings: tuple[str, ...] = field(default=())
+    intervals: Intervals | None = None
+
+    def __repr__(self) -> str:
+        runs = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
+        lines = [f"<Validation on {runs}, {len(self.channels)} channels"]
+        for model in self.models:
+            line = f"  {model}: {self.completed(model)} of {len(self.runs)} rollouts completed"
+            means = {c.name: self.mean_nrmse(model, c.name) for c in self.channels}
+            found = [(v, name) for name, v in means.items() if v is not None]
+            if found:
+                (low, best), (high, worst) = min(found), max(found)
+                line += f", mean NRMSE {low:.2f} ({best}) to {high:.2f} ({worst})"
+            lines.append(printable(line))
+        return "\n".join(lines) + ">"
+
+    def mean_nrmse(self, model: str, channel: str) -> float | None:
+        """Mean NRMSE over the test runs; None if the model did not complete all of them."""
+        return self.mean_error(model, channel, "nrmse")
+
+    def mean_error(self, model: str, channel: str, what: str) -> float | None:
+        """Mean of one figure of `ChannelError` over the test runs, as `mean_nrmse`."""
+        found = [r.models[model].errors.get(channel) for r in self.runs]
+        values = [getattr(e, what) for e in found if e is not None]
+        return float(np.mean(values)) if len(values) == len(self.runs) else None
+
+    def coverage(self, channel: str) -> list[float] | None:
+        """Share of the time inside the prediction intervals per run; None as for `mean_nrmse`."""
+        if self.intervals is None:
+            return None
+        found = [r.models[MULTI_FIDELITY].coverage.get(channel) for r in self.runs]
+        shares = [share for share in found if share is not None]
+        return shares if len(shares) == len(self.runs) else None
+
+    def endings(self) -> list[str]:
+        """One sentence per rollout that ended early."""
+        return [
+            f"{name} on {r.recorded.name}: {m.simulation.reason}"
+            for r in self.runs
+            for name, m in r.models.items()
+            if m.simulation.status is not Status.COMPLETED
+        ]
+
+    def outside(self) -> list[str]:
+        """One sentence per model that spent much of its time outside the training range."""
+        found = []
+        for name in self.models:
+            shares = [r.models[name].simulation.outside for r in self.runs]
+            if max(shares) > MUCH_OUTSIDE:
+                found.append(
+                    f"{name}: up to {max(shares):.0%} of a rollout has an input or state outside "
+                    "the training range"
+                )
+        return found
+
+    def completed(self, model: str) -> int:
+        """Number of test runs that a model simulated to the end."""
+        return sum(r.models[model].simulation.status is Status.COMPLETED for r in self.runs)
+
+    def wall_time(self, model: str) -> float:
+        """Mean wall time per rollout in s, compiled; one that ended early costs no less."""
+        return float(np.mean([r.models[model].simulation.wall_time for r in self.runs]))
+
+    def speed_up(self, model: str) -> float | None:
+        """Recorded wall time of the simulator over that of the model, if the runs carry it."""
+        times = [r.recorded.wall_time for r in self.runs]
+        known = [t for t in times if t is not None]
+        if len(known) < len(times):
+            return None
+        return float(np.mean(known)) / self.wall_time(model)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values: all figures, without time series and spectra; None where not finite."""
+        values = {
+            "format": 1,
+            "channels": [{"name": c.name, "unit": c.unit, "role": c.role} for c in self.channels],
+            "models": {name: self._model_dict(name) for name in self.models},
+            "runs": [_run_dict(r) for r in self.runs],
+            "histograms": {
+                name: {
+                    "edges": h.edges.tolist(),
+                    "counts": {m: c.tolist() for m, c in h.counts.items()},
+                }
+                for name, h in self.histograms.items()
+            },
+            "eigenvalues": [
+                {"schedule": s, "real": v.real.tolist(), "imag": v.imag.tolist()}
+                for s, v in self.eigenvalues
+            ],
+            "warnings": list(self.warnings),
+            "provenance": self.record,
+            "intervals": self._intervals_dict(),
+        }
+        return dict(json_value(values))
+
+    def _intervals_dict(self) -> dict[str, Any] | None:
+        if self.intervals is None:
+            return None
+        shares = {c.name: self.coverage(c.name) for c in self.channels}
+        means = {name: float(np.mean(s)) if s else None for name, s in shares.items()}
+        level, runs = self.intervals.level, self.intervals.runs
+        return {"level": level, "runs": runs, "mean_coverage": means}
+
+    def _model_dict(self, name: str) -> dict[str, Any]:
+        return {
+            "completed": self.completed(name),
+            "of": len(self.runs),
+            "mean_nrmse": {c.name: self.mean_nrmse(name, c.name) for c in self.channels},
+            "wall_time_s": self.wall_time(name),
+            "speed_up": self.speed_up(name),
+        }
+
+
+def _run_dict(run: RunComparison) -> dict[str, Any]:
+    def statistics(found: Mapping[str, ChannelStatistics]) -> dict[str, Any]:
+        return {
+            name: {
+                "min": s.minimum,
+                "mean": s.mean,
+                "max": s.maximum,
+                "std": s.std,
+                "peaks_hz": dict(s.peaks),
+                "band_power": dict(s.power),
+                "del_1hz": dict(s.damage),
+            }
+            for name, s in found.items()
+        }
+
+    return {
+        "name": run.recorded.name,
+        "duration_s": run.recorded.duration,
+        "simulator_wall_time_s": run.recorded.wall_time,
+        "parameters": dict(run.parameters),
+        "statistics": statistics(run.statistics),
+        "models": {
+            name: {
+                "status": m.simulation.status.name.lower(),
+                "message": m.simulation.message,
+                "ended_s": m.simulation.ended,
+                "outside": m.simulation.outside,
+                "wall_time_s": m.simulation.wall_time,
+                "errors": {c: asdict(e) for c, e in m.errors.items()},
+                "derivative_nrmse": dict(m.derivative_errors),
+                "coverage": dict(m.coverage),
+                "statistics": statistics(m.statistics),
+            }
+            for name, m in run.models.items()
+        },
+    }
