@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from dfsm.control import DirectTranscription, solve
-
-ROOT = Path(__file__).parents[1]
 from benchmarks import control, readme
 from benchmarks.casadi_expressions import solve_with_expressions
 from benchmarks.known_problems import PROBLEMS
+from dfsm.control import DirectTranscription, solve
+
+ROOT = Path(__file__).parents[1]
 
 
 def documented(name: str) -> list[list[str]]:

@@ -9,10 +9,10 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 import dfsm
-
-ROOT = Path(__file__).parents[1]
 from benchmarks import limits, matched, readme
 from benchmarks.accuracy import demo
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_the_thrust_is_that_of_the_run():

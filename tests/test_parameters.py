@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import dfsm
+from benchmarks import parameters, readme
 from conftest import write_config
 from dfsm.config.fit import parse_config
 from dfsm.data.readers import read
@@ -21,7 +22,6 @@ from dfsm.simulators.two_link_robot import holding_torques
 from systems import SPRING
 
 ROOT = Path(__file__).parents[1]
-from benchmarks import parameters, readme
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*linear fit is unstable:dfsm.errors.DfsmWarning")
 

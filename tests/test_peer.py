@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import dfsm
-from dfsm.core.files import json_value
-
-ROOT = Path(__file__).parents[1]
 from benchmarks import peer, readme
 from benchmarks.accuracy import demo
 from benchmarks.rollouts import judged
+from dfsm.core.files import json_value
+
+ROOT = Path(__file__).parents[1]
 
 START = round(peer.WARM_UP / peer.STEP)
 

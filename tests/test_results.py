@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import accuracy, derivatives, readme
 from dfsm.demos.two_link_robot.article import beyond_section, extraction_section, taylor_section
 from dfsm.demos.two_link_robot.defaults import DEFAULT, KINDS, PEER, fit_kinds
 from dfsm.demos.two_link_robot.extraction import ExtractionSettings, extraction
@@ -16,7 +17,6 @@ from dfsm.demos.two_link_robot.taylor import TaylorSettings, compare_with_taylor
 from dfsm.report.article import Table
 
 ROOT = Path(__file__).parents[1]
-from benchmarks import accuracy, derivatives, readme
 
 ROBOT = "docs/two-link-robot.md"
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
 from benchmarks import readme, scaling
+
+ROOT = Path(__file__).parents[1]
 
 # One of ten test runs is swung further than the training runs usually are.
 pytestmark = pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning")
