@@ -38,7 +38,7 @@ def write_article(article: Article, path: str | Path) -> None:
     data = {"figures": figures, "blobs": blobs.encoded}
     header = element("header", element("h1", article.title), element("p", article.lede, cls="lede"))
     body = join(header, element("main", *[_section(s) for s in article.sections]))
-    text = document(article.title, body, data, script="article.js", css=("article.css",))
+    text = document(article.title, body, data, scripts=("article.js",), css=("article.css",))
     write_document(text, path)
 
 

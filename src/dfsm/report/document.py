@@ -16,7 +16,9 @@ from dfsm.report.elements import Markup
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
-def document(title: str, body: Markup, data: Any, *, script: str, css: tuple[str, ...] = ()) -> str:
+def document(
+    title: str, body: Markup, data: Any, *, scripts: tuple[str, ...], css: tuple[str, ...] = ()
+) -> str:
     """Return a page with Plotly, its data and the script that draws them.
 
     Parameters
@@ -26,16 +28,16 @@ def document(title: str, body: Markup, data: Any, *, script: str, css: tuple[str
     body
         Content.
     data
-        JSON values, found by the script in the element ``data``.
-    script
-        File of this package.
+        JSON values, which the scripts read from the element ``data``.
+    scripts
+        Files of this package, in the order in which they run.
     css
         Files of this package besides ``page.css``.
     """
     from plotly.offline import get_plotlyjs
 
     own = files("dfsm.report")
-    scripts = [get_plotlyjs(), (own / script).read_text(encoding="utf-8")]
+    code = [get_plotlyjs(), *((own / name).read_text(encoding="utf-8") for name in scripts)]
     style = "".join((own / name).read_text(encoding="utf-8") for name in ("page.css", *css))
     return "\n".join(
         [
@@ -43,7 +45,7 @@ def document(title: str, body: Markup, data: Any, *, script: str, css: tuple[str
             '<html lang="en">',
             "<head>",
             '<meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{_policy(scripts)}">',
+            f'<meta http-equiv="Content-Security-Policy" content="{_policy(code)}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             '<meta name="color-scheme" content="light dark">',
             f"<title>{escape(title)}</title>",
@@ -51,7 +53,7 @@ def document(title: str, body: Markup, data: Any, *, script: str, css: tuple[str
             "</head>",
             f"<body>{body}",
             f'<script type="application/json" id="data">{embed(data)}</script>',
-            *[f"<script>{s}</script>" for s in scripts],
+            *[f"<script>{s}</script>" for s in code],
             "</body>",
             "</html>",
             "",

@@ -50,7 +50,7 @@ def write_report(
 
 def _page(validations: Mapping[str, Validation], title: str) -> str:
     body = join(_header(validations, title), _main(validations))
-    return document(title, body, page_data(validations), script="page.js")
+    return document(title, body, page_data(validations), scripts=("panels.js", "page.js"))
 
 
 # -- layout -------------------------------------------------------------------------------------
