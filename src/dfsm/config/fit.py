@@ -16,10 +16,7 @@ from dfsm.data.features import Feature
 from dfsm.data.readers import read_all
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.fitting.corrective import NoCorrection
-from dfsm.fitting.corrective.gaussian_process import GP
-from dfsm.fitting.corrective.perceptron import MLP
-from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
+from dfsm.fitting.corrective import MLP, CorrectiveSettings
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
@@ -97,9 +94,7 @@ class Config(Strict):
     signals: SignalConfig
     derivatives: DerivativeSettings = DerivativeSettings()
     linear: Annotated[LTI | LPV, Field(discriminator="kind")] = LTI()
-    corrective: Annotated[
-        RBF | IncrementalRBF | GP | MLP | NoCorrection, Field(discriminator="kind")
-    ] = MLP()
+    corrective: Annotated[CorrectiveSettings, Field(discriminator="kind")] = MLP()
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only

@@ -282,12 +282,12 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
     """f̂_NL: the same corrective function for every row, and nothing linear under it."""
 
     def part(inputs: Array, targets: Array) -> tuple[LinearModel, Corrective | None]:
-        if not targets.shape[1] or isinstance(settings.corrective, NoCorrection):
-            raise ValueError("nothing to fit")
         mean = targets.mean(axis=0)
         trained = fit_corrective(
             inputs, targets - mean, samples.runs, settings.corrective, settings.seed
         )
+        if trained is None:
+            raise ValueError("nothing to fit")
         zero = jnp.zeros((1, targets.shape[1], inputs.shape[1]))
         return LinearModel(jnp.zeros(1), zero, jnp.asarray(mean)[None], None), trained.function
 

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.data.derivatives import kinematic_rows
-from dfsm.fitting.corrective import NoCorrection, fit_corrective
+from dfsm.fitting.corrective import CorrectiveFit, fit_corrective
 from dfsm.fitting.linear import LinearFit
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
-from dfsm.models.corrective import Corrective, ignoring
+from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
 
 # A correction is kept if it explains at least this share of the residual's variance on runs left
@@ -86,19 +86,15 @@ def correct(
     derivatives = targets is samples.derivatives
     known = kinematic_rows(settings.states) if derivatives else {}
     large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > settings.gate]
+    hidden, trained = linear.model.known_inputs, None
+    if large and not later:
+        trained = _train(inputs, residuals[:, large], hidden, samples.runs, settings)
     function, explained, detail = None, dict[int, float](), ""
-    if large and not later and not isinstance(settings.corrective, NoCorrection):
-        hidden, seen = list(linear.model.known_inputs), inputs
-        if hidden:
-            seen = inputs.copy()
-            seen[:, hidden] = inputs[:, hidden].mean(axis=0)
-        trained = fit_corrective(
-            seen, residuals[:, large], samples.runs, settings.corrective, settings.seed
-        )
+    if trained is not None:
         explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
         # A correction that does no good on runs left out of training would only do harm.
         kept = [k for k, share in enumerate(trained.explained) if share > _WORTHWHILE]
-        function = ignoring(trained.function.select(kept), hidden) if kept else None
+        function = trained.function.select(kept).ignoring(hidden) if kept else None
         large = [large[k] for k in kept]
     else:
         large = []
@@ -134,6 +130,22 @@ def correct(
             }
         )
     return Correction(function, tuple(large), decisions)
+
+
+def _train(
+    inputs: Array,
+    residuals: Array,
+    hidden: Sequence[int],
+    runs: IntArray,
+    settings: FitSettings,
+) -> CorrectiveFit | None:
+    """Train on inputs of which some, whose effect physics gave, are held at their mean."""
+    seen = inputs
+    if hidden:
+        columns = list(hidden)
+        seen = inputs.copy()
+        seen[:, columns] = inputs[:, columns].mean(axis=0)
+    return fit_corrective(seen, residuals, runs, settings.corrective, settings.seed)
 
 
 def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:

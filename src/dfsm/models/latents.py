@@ -22,7 +22,6 @@ import numpy as np
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.models.corrective import Corrective, GaussianUnits
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
@@ -229,9 +228,9 @@ def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Arra
     names = tuple(Channel(f"latent{k + 1}", "-") for k in range(count))
     wide = DFSM(
         f=f,
-        e=None if model.e is None else _ignoring(model.e, at, count),
+        e=None if model.e is None else model.e.with_more_inputs(at, count),
         g=None if model.g is None else wider(model.g, 0),
-        e_g=None if model.e_g is None else _ignoring(model.e_g, at, count),
+        e_g=None if model.e_g is None else model.e_g.with_more_inputs(at, count),
         region=_with_range(model.region, at, 0, paths),
         corrected=model.corrected,
         corrected_outputs=model.corrected_outputs,
@@ -246,27 +245,6 @@ def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
     s = model.signals
     region = _with_range(model.region, s.observed_columns.stop, len(s.latents), paths)
     return replace(model, region=replace(region, operating=at_rest(model, region.operating)))
-
-
-def _ignoring(corrective: Corrective, at: int, count: int) -> Corrective:
-    """The same function of more inputs, the new ones without effect."""
-    place = np.full(count, at)
-    shift = jnp.insert(corrective.shift, place, 0.0)
-    if isinstance(corrective, GaussianUnits):
-        # Infinitely wide in the new directions.
-        return replace(
-            corrective,
-            shift=shift,
-            scale=jnp.insert(corrective.scale, place, jnp.inf),
-            centres=jnp.insert(corrective.centres, place, 0.0, axis=0),
-        )
-    first, *others = corrective.weights
-    return replace(
-        corrective,
-        shift=shift,
-        scale=jnp.insert(corrective.scale, place, 1.0),
-        weights=(jnp.insert(first, place, 0.0, axis=1), *others),
-    )
 
 
 def _with_range(region: Region, at: int, old: int, paths: Sequence[Array]) -> Region:

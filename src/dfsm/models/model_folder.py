@@ -19,7 +19,7 @@ from dfsm.core.bundle import MANIFEST, Bundle
 from dfsm.core.files import check_folder
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
-from dfsm.models.corrective import Corrective, GaussianUnits, Perceptron
+from dfsm.models.corrective import FORMS, Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
@@ -123,22 +123,16 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
             structure[name] = {"schedule": linear.schedule, "known": linear.known}
     for name, corrective in (("e", model.e), ("e_g", model.e_g)):
         structure[name] = None
-        if isinstance(corrective, GaussianUnits):
-            keep(name, corrective, _GAUSSIAN)
-            structure[name] = {"kind": "gaussian_units"}
-        elif isinstance(corrective, Perceptron):
-            keep(name, corrective, ("shift", "scale"))
-            for i, (W, b) in enumerate(zip(corrective.weights, corrective.biases, strict=True)):
-                tensors[f"{prefix}/{name}/weights.{i}"] = np.asarray(W)
-                tensors[f"{prefix}/{name}/biases.{i}"] = np.asarray(b)
-            structure[name] = {"kind": "perceptron", "layers": len(corrective.weights)}
+        if corrective is not None:
+            for field, array in corrective.arrays().items():
+                tensors[f"{prefix}/{name}/{field}"] = np.asarray(array)
+            structure[name] = corrective.structure()
     return structure
 
 
 _REGION = ("low", "high", "mean", "std", "grid", "operating", "whitening")
 _NO_DENSITY = np.zeros((0, 0, 0))  # of models that were saved before they had one
 _LINEAR = ("grid", "coefficients", "offsets")
-_GAUSSIAN = ("shift", "scale", "centres", "weights", "bias")
 
 
 def _put_together(
@@ -148,32 +142,29 @@ def _put_together(
     signals: SignalTable,
     provenance: Provenance,
 ) -> DFSM:
-    given = {f"{prefix}/region/whitening": _NO_DENSITY, **tensors}
+    complete = {f"{prefix}/region/whitening": _NO_DENSITY, **tensors}
 
-    def arrays(name: str, fields: tuple[str, ...]) -> list[Any]:
-        return [jnp.asarray(given[f"{prefix}/{name}/{field}"]) for field in fields]
+    def arrays(name: str) -> dict[str, Any]:
+        start = f"{prefix}/{name}/"
+        return {
+            key.removeprefix(start): jnp.asarray(array)
+            for key, array in complete.items()
+            if key.startswith(start)
+        }
 
     def linear(name: str) -> LinearModel | None:
-        found = structure[name]
-        if found is None:
+        told = structure[name]
+        if told is None:
             return None
-        grid, coefficients, offsets = arrays(name, _LINEAR)
-        known = tuple((int(row), int(column)) for row, column in found.get("known", ()))
-        return LinearModel(grid, coefficients, offsets, found["schedule"], known)
+        known = tuple((int(row), int(column)) for row, column in told.get("known", ()))
+        grid, coefficients, offsets = (arrays(name)[field] for field in _LINEAR)
+        return LinearModel(grid, coefficients, offsets, told["schedule"], known)
 
     def corrective(name: str) -> Corrective | None:
-        found = structure[name]
-        if found is None:
-            return None
-        if found["kind"] == "gaussian_units":
-            return GaussianUnits(*arrays(name, _GAUSSIAN))
-        layers = range(found["layers"])
-        return Perceptron(
-            *arrays(name, ("shift", "scale")),
-            weights=tuple(arrays(name, tuple(f"weights.{i}" for i in layers))),
-            biases=tuple(arrays(name, tuple(f"biases.{i}" for i in layers))),
-        )
+        told = structure[name]
+        return None if told is None else FORMS[told["kind"]].restored(arrays(name), told)
 
+    region = {field: arrays("region")[field] for field in _REGION}
     f = linear("f")
     if f is None:
         raise KeyError("f")
@@ -185,7 +176,7 @@ def _put_together(
         e=corrective("e"),
         g=linear("g"),
         e_g=corrective("e_g"),
-        region=Region(*arrays("region", _REGION), **structure.get("region", {})),
+        region=Region(**region, **structure.get("region", {})),
         corrected=tuple(structure["corrected"]),
         corrected_outputs=tuple(structure["corrected_outputs"]),
         signals=signals,

@@ -16,7 +16,7 @@ import numpy as np
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.derivatives import kinematic_rows
-from dfsm.models.corrective import Corrective, GaussianUnits, Perceptron
+from dfsm.models.corrective import Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, poles, with_poles
 from dfsm.models.linear import LinearModel
@@ -102,11 +102,7 @@ class Parametrization(eqx.Module):
     @property
     def _corrective_shapes(self) -> list[tuple[int, ...]]:
         e = self.model.e
-        if isinstance(e, GaussianUnits):
-            return [e.weights.shape, e.bias.shape]
-        if isinstance(e, Perceptron):
-            return [a.shape for a in (*e.weights, *e.biases)]
-        return []
+        return [] if e is None else [a.shape for a in e.parameters]
 
     def at(self, deviations: jax.Array) -> DFSM:
         """The model at some deviations, shape ``(parameter,)``; JAX can follow it."""
@@ -259,16 +255,4 @@ class Parametrization(eqx.Module):
             return None
         place = {row: k for k, row in enumerate(self.rows)}
         scale = jnp.asarray([self.spread[place[row]] for row in self.model.corrected])
-        if isinstance(e, GaussianUnits):
-            weights, bias = parts
-            return replace(
-                e, weights=e.weights + scale[:, None] * weights, bias=e.bias + scale * bias
-            )
-        n = len(e.weights)
-        weights = [*parts[: n - 1], scale[:, None] * parts[n - 1]]
-        biases = [*parts[n:-1], scale * parts[-1]]
-        return replace(
-            e,
-            weights=tuple(a + b for a, b in zip(e.weights, weights, strict=True)),
-            biases=tuple(a + b for a, b in zip(e.biases, biases, strict=True)),
-        )
+        return e.moved(parts, scale)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.types import Array
-from dfsm.models.corrective import Perceptron, ignoring
+from dfsm.models.corrective import Perceptron
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, add_latents, as_states
 from dfsm.refinement.parameters import Parametrization
@@ -113,8 +113,7 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
-    function = ignoring(network, model.f.known_inputs)
-    return replace(model, e=function, corrected=rows)
+    return replace(model, e=network.ignoring(model.f.known_inputs), corrected=rows)
 
 
 def _poles(decay: Array, drive: Array, middle: Array) -> Poles:

@@ -1,56 +1,39 @@
 """The nonlinear error-corrective function e(I): what the linear fit leaves over (Sec. 3.6).
 
-One file per kind of training (`rbf`, `gaussian_process`, `perceptron`); what comes out is one of
-the two JAX modules in `functions`. Inputs are standardised inside; the values that go in and come
-out are in physical units.
+One file per kind of training. A new kind is a file like `gaussian_process.py`, a settings class
+with a method `train`, and its name in `CorrectiveSettings`: from there configuration files know it.
+What comes out of training is one of the forms in `models.corrective`. Inputs are standardised
+inside; the values that go in and come out are in physical units.
 """
 
 from __future__ import annotations
 
-from typing import Literal
-
-from dfsm.core.settings import settings_class
 from dfsm.core.types import Array, IntArray
-from dfsm.fitting.corrective.gaussian_process import GP, fit_gp
-from dfsm.fitting.corrective.perceptron import MLP, fit_mlp
-from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF, fit_rbf
-from dfsm.fitting.corrective.training import CorrectiveFit, TrainingSet
-from dfsm.models.corrective import Corrective, GaussianUnits, Perceptron, ignoring
-from dfsm.numerics.sampling import subsample
+from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.corrective.none import NoCorrection
+from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
+from dfsm.fitting.corrective.training import CorrectiveFit, CorrectiveKind, TrainingSet
 
 __all__ = [
     "GP",
     "MLP",
     "RBF",
-    "Corrective",
     "CorrectiveFit",
+    "CorrectiveKind",
     "CorrectiveSettings",
-    "GaussianUnits",
     "IncrementalRBF",
     "NoCorrection",
-    "Perceptron",
     "fit_corrective",
-    "ignoring",
 ]
 
-
-@settings_class
-class NoCorrection:
-    """Leave the linear fit as it is."""
-
-    kind: Literal["none"] = "none"
-
-
+# Every kind that there is, told apart by its `kind`.
 CorrectiveSettings = RBF | IncrementalRBF | GP | MLP | NoCorrection
 
 
 def fit_corrective(
-    inputs: Array,
-    residuals: Array,
-    runs: IntArray,
-    settings: RBF | IncrementalRBF | GP | MLP,
-    seed: int = 0,
-) -> CorrectiveFit:
+    inputs: Array, residuals: Array, runs: IntArray, settings: CorrectiveKind, seed: int = 0
+) -> CorrectiveFit | None:
     """Train a corrective function on the residuals of the linear fit (Sec. 3.6).
 
     Parameters
@@ -69,17 +52,12 @@ def fit_corrective(
 
     Returns
     -------
-    CorrectiveFit
+    CorrectiveFit or None
+        None where the settings say that nothing is to be corrected.
 
     Raises
     ------
     DfsmError
         More units than samples.
     """
-    data = TrainingSet.build(inputs, residuals, runs)
-    if isinstance(settings, MLP):
-        return fit_mlp(data, settings, seed)
-    points = subsample(data.z, settings.samples, settings.sampling, seed)
-    if isinstance(settings, GP):
-        return fit_gp(data, points, settings, seed)
-    return fit_rbf(data, points, settings, seed)
+    return settings.train(TrainingSet.build(inputs, residuals, runs), seed)

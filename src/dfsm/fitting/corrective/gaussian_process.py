@@ -13,7 +13,7 @@ from dfsm.core.types import Array
 from dfsm.fitting.corrective.gaussians import activations, gaussian_units, mean_diagonal, unit_sums
 from dfsm.fitting.corrective.length_scales import hyper_parameters
 from dfsm.fitting.corrective.training import CorrectiveFit, TrainingSet, cross_validated
-from dfsm.numerics.sampling import Method, Subsample
+from dfsm.numerics.sampling import Method, subsample
 
 # Eigenvalues of a kernel matrix below this share of the largest are rounding.
 _LEAST = 1e-9
@@ -43,24 +43,24 @@ class GP:
     def __post_init__(self) -> None:
         require(self.samples >= 1, "corrective.samples", self.samples, "at least 1")
 
-
-def fit_gp(data: TrainingSet, points: Subsample, settings: GP, seed: int) -> CorrectiveFit:
-    """Train a Gaussian process; one kernel is shared by all targets."""
-    means = points.means(data.targets)
-    signal, noise, lengths = hyper_parameters(points.points, means, seed)
-    kernel = _Kernel(points.points, np.sqrt(2.0) * lengths, signal)
-    # The scatter within the clusters is the noise of single samples; that of means is smaller.
-    scatter = noise + float(np.mean((data.targets - means[points.labels]) ** 2))
-    if settings.targets == "all":
-        weights = kernel.sparse_weights(data, scatter)
-    else:
-        weights = kernel.exact_weights(means, noise)
-    bias = np.zeros(means.shape[1])
-    return CorrectiveFit(
-        function=gaussian_units(data, kernel.points, kernel.width, weights, bias),
-        explained=cross_validated(data, lambda rest: kernel.predictor(rest, scatter)),
-        detail=f"{len(means)} points, length scales " + ", ".join(f"{v:.2g}" for v in lengths),
-    )
+    def train(self, data: TrainingSet, seed: int) -> CorrectiveFit:
+        """Train a Gaussian process; one kernel is shared by all targets."""
+        points = subsample(data.z, self.samples, self.sampling, seed)
+        means = points.means(data.targets)
+        signal, noise, lengths = hyper_parameters(points.points, means, seed)
+        kernel = _Kernel(points.points, np.sqrt(2.0) * lengths, signal)
+        # The scatter within the clusters is the noise of single samples; that of means is smaller.
+        scatter = noise + float(np.mean((data.targets - means[points.labels]) ** 2))
+        if self.targets == "all":
+            weights = kernel.sparse_weights(data, scatter)
+        else:
+            weights = kernel.exact_weights(means, noise)
+        bias = np.zeros(means.shape[1])
+        return CorrectiveFit(
+            function=gaussian_units(data, kernel.points, kernel.width, weights, bias),
+            explained=cross_validated(data, lambda rest: kernel.predictor(rest, scatter)),
+            detail=f"{len(means)} points, length scales " + ", ".join(f"{v:.2g}" for v in lengths),
+        )
 
 
 @dataclass(frozen=True)

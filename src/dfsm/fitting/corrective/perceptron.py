@@ -55,9 +55,12 @@ class MLP:
         require(self.weight_decay >= 0, "corrective.weight_decay", self.weight_decay, "0 or more")
         require(self.samples >= 1, "corrective.samples", self.samples, "at least 1")
 
+    def train(self, data: TrainingSet, seed: int) -> CorrectiveFit:
+        """Train a perceptron; the last fold of the runs decides when to stop."""
+        return _train(data, self, seed)
 
-def fit_mlp(data: TrainingSet, settings: MLP, seed: int) -> CorrectiveFit:
-    """Train a perceptron; the last fold of the runs decides when to stop."""
+
+def _train(data: TrainingSet, settings: MLP, seed: int) -> CorrectiveFit:
     last = data.folds == data.folds.max()
     held = data.subset(last).thinned(SEARCH_SAMPLES)
     train = data.subset(~last).spread(settings.samples, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Literal
 
@@ -14,13 +14,13 @@ from dfsm.fitting.corrective.gaussians import gaussian_units, unit_sums
 from dfsm.fitting.corrective.length_scales import hyper_parameters
 from dfsm.fitting.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
 from dfsm.numerics.least_squares import NormalEquations, merge
-from dfsm.numerics.sampling import Method, Subsample
+from dfsm.numerics.sampling import Method, Subsample, subsample
 
 # Widths tried first, as multiples of the typical distance between two standardised samples; then
 # the neighbours of the best.
 _WIDTHS = (0.5, 1.0, 2.0)
 _FINER = np.sqrt(2.0)
-# Cluster means that the length scales are found from: the work grows with their third power.
+# Cluster means that the length scales come from: the work grows with their third power.
 _LENGTH_POINTS = 200
 _RIDGES = 10.0 ** np.arange(-9.0, 1.0)
 
@@ -57,6 +57,10 @@ class RBF:
     def __post_init__(self) -> None:
         _check_units(self.samples, self.width)
 
+    def train(self, data: TrainingSet, seed: int) -> CorrectiveFit:
+        """Train a network of all units."""
+        return _train(data, self, seed)
+
 
 @settings_class
 class IncrementalRBF:
@@ -89,6 +93,14 @@ class IncrementalRBF:
         require(self.neurons >= 1, "corrective.neurons", self.neurons, "at least 1")
         require(self.goal >= 0, "corrective.goal", self.goal, "0 or more")
 
+    def train(self, data: TrainingSet, seed: int) -> CorrectiveFit:
+        """Train a network of the units that help most."""
+
+        def choose(Q: Array, right: Array, power: Array) -> IntArray:
+            return _forward_selection(Q, right, power, self.goal, self.neurons)
+
+        return _train(data, self, seed, choose)
+
 
 def _check_units(samples: int, width: float | None) -> None:
     require(samples >= 1, "corrective.samples", samples, "at least 1")
@@ -96,30 +108,37 @@ def _check_units(samples: int, width: float | None) -> None:
     require(positive, "corrective.width", width, "a positive number")
 
 
-def fit_rbf(
-    data: TrainingSet, points: Subsample, settings: RBF | IncrementalRBF, seed: int
+def _train(
+    data: TrainingSet,
+    settings: RBF | IncrementalRBF,
+    seed: int,
+    choose: Callable[[Array, Array, Array], IntArray] | None = None,
 ) -> CorrectiveFit:
-    """Train an RBF network: width and ridge by cross-validation, then weights on all targets."""
+    """Width and ridge by cross-validation, then weights of all units, or of some, on all targets.
+
+    `choose` tells which units from their products with each other and with the targets, and the
+    targets' squares.
+    """
+    points = subsample(data.z, settings.samples, settings.sampling, seed)
     tried = []
     if settings.directions == "per_input":
         tried.append(_relative_lengths(data, points, seed))
     tried.append(np.ones(data.z.shape[1]))
     # Likelihood may take levels of an input for unrelated functions; runs left out know better.
-    found = [_search(data, points, lengths, settings.width) for lengths in tried]
-    k = int(np.argmin([error.sum() for error, _, _ in found]))
-    (error, ridge, width), lengths = found[k], tried[k]
+    fits = [_search(data, points, lengths, settings.width) for lengths in tried]
+    k = int(np.argmin([error.sum() for error, _, _ in fits]))
+    (error, ridge, width), lengths = fits[k], tried[k]
     data, points = data.stretched(lengths), replace(points, points=points.points / lengths)
     size = width * data.typical_distance
     total = _final_sums(data, points, size, settings.targets)
     mean, products = total.moments(centred=True)
     n = len(points.points)
     Q, right = products[:n, :n], products[:n, n:]
-    if isinstance(settings, IncrementalRBF):
-        used = _forward_selection(Q, right, np.diag(products)[n:], settings.goal, settings.neurons)
+    used = np.arange(n)
+    if choose is not None:
+        used = choose(Q, right, np.diag(products)[n:])
         # Few units explain less than all candidates do, and want another ridge.
         error, ridge = _cross_validate(data.thinned(SEARCH_SAMPLES), points.points[used], size)
-    else:
-        used = np.arange(n)
     eigenvalues, V = np.linalg.eigh(Q[np.ix_(used, used)])
     weights = V @ _shrink(V.T @ right[used], eigenvalues, ridge)
     function = gaussian_units(
@@ -133,7 +152,7 @@ def fit_rbf(
 def _search(
     data: TrainingSet, points: Subsample, lengths: Array, width: float | None
 ) -> tuple[Array, Array, float]:
-    """Error on left-out runs, ridges and relative width for given lengths; the best, or as given.
+    """Error on left-out runs, ridges and relative width for some lengths; the best, or as set.
 
     Parameters
     ----------

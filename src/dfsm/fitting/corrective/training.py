@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +116,32 @@ class TrainingSet:
         """Keep some samples under the same standardisation."""
         kept = {name: getattr(self, name)[keep] for name in ("z", "targets", "runs", "folds")}
         return replace(self, **kept)
+
+
+class CorrectiveKind(Protocol):
+    """Settings of one kind of corrective function, which know how it is trained."""
+
+    @property
+    def kind(self) -> str:
+        """What configuration files call it."""
+        ...
+
+    def train(self, data: TrainingSet, seed: int) -> CorrectiveFit | None:
+        """Train on samples; None where nothing is to be corrected.
+
+        Parameters
+        ----------
+        data
+            Standardised; the function that comes out takes and gives physical units.
+        seed
+            Of everything random.
+
+        Raises
+        ------
+        DfsmError
+            The samples do not suffice.
+        """
+        ...
 
 
 def cross_validated(

@@ -1,4 +1,4 @@
-"""The two forms that every corrective function takes when it is evaluated."""
+"""Gaussian units: what RBF networks and Gaussian processes are evaluated as."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import dfsm.core.jax_setup  # noqa: F401
+from dfsm.models.corrective.form import Corrective
 
 
-class GaussianUnits(eqx.Module):
+class GaussianUnits(Corrective):
     """Σ_i w_i exp(-|z - c_i|²) + bias, with ``z = (I - shift) / scale`` (Eq. 8).
 
     Attributes
@@ -26,8 +26,7 @@ class GaussianUnits(eqx.Module):
         In the unit of the target, shapes ``(target, unit)`` and ``(target,)``.
     """
 
-    shift: jax.Array
-    scale: jax.Array
+    kind = "gaussian_units"
     centres: jax.Array
     weights: jax.Array
     bias: jax.Array
@@ -37,7 +36,7 @@ class GaussianUnits(eqx.Module):
         return self.prepared()(inputs)
 
     def prepared(self) -> ProductForm:
-        """The same function in the form that is fastest to evaluate again and again."""
+        """The same function with the square of the distance multiplied out."""
         norms = jnp.sum(self.centres**2, axis=0)
         matrix = jnp.concatenate([2 * self.centres, -norms[None], -jnp.ones_like(norms)[None]])
         return ProductForm(self.shift, self.scale, matrix, self.weights, self.bias)
@@ -45,8 +44,30 @@ class GaussianUnits(eqx.Module):
     def select(self, rows: Sequence[int]) -> GaussianUnits:
         """Keep some of the targets."""
         keep = np.array(rows)
-        return GaussianUnits(
-            self.shift, self.scale, self.centres, self.weights[keep], self.bias[keep]
+        return replace(self, weights=self.weights[keep], bias=self.bias[keep])
+
+    def with_more_inputs(self, at: int, count: int) -> GaussianUnits:
+        """The same function of more inputs: its units are infinitely wide in their directions."""
+        place = np.full(count, at)
+        return replace(
+            self,
+            shift=jnp.insert(self.shift, place, 0.0),
+            scale=jnp.insert(self.scale, place, jnp.inf),
+            centres=jnp.insert(self.centres, place, 0.0, axis=0),
+        )
+
+    @property
+    def parameters(self) -> tuple[jax.Array, ...]:
+        """Weights and bias; the units stay where they are."""
+        return self.weights, self.bias
+
+    def moved(self, deviations: Sequence[jax.Array], spread: jax.Array) -> GaussianUnits:
+        """The function with other weights and another bias."""
+        weights, bias = deviations
+        return replace(
+            self,
+            weights=self.weights + spread[:, None] * weights,
+            bias=self.bias + spread * bias,
         )
 
 
@@ -76,49 +97,3 @@ class ProductForm(eqx.Module):
         z = (inputs - self.shift) / self.scale
         exponents = jnp.concatenate([z, jnp.ones(1), jnp.sum(z**2)[None]]) @ self.matrix
         return self.weights @ jnp.exp(exponents) + self.bias
-
-
-class Perceptron(eqx.Module):
-    """Fully connected tanh network on standardised inputs, linear output layer.
-
-    Attributes
-    ----------
-    shift, scale
-        Per input, shape ``(input,)``.
-    weights, biases
-        Per layer, shapes ``(out, in)`` and ``(out,)``; the last layer is in the target's unit.
-    """
-
-    shift: jax.Array
-    scale: jax.Array
-    weights: tuple[jax.Array, ...]
-    biases: tuple[jax.Array, ...]
-
-    def __call__(self, inputs: jax.Array) -> jax.Array:
-        """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
-        z = (inputs - self.shift) / self.scale
-        for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            z = jnp.tanh(W @ z + b)
-        return self.weights[-1] @ z + self.biases[-1]
-
-    def prepared(self) -> Perceptron:
-        """Itself: there is nothing to compute beforehand."""
-        return self
-
-    def select(self, rows: Sequence[int]) -> Perceptron:
-        """Keep some of the targets."""
-        keep = np.array(rows)
-        return Perceptron(
-            self.shift,
-            self.scale,
-            (*self.weights[:-1], self.weights[-1][keep]),
-            (*self.biases[:-1], self.biases[-1][keep]),
-        )
-
-
-Corrective = GaussianUnits | Perceptron
-
-
-def ignoring(function: Corrective, columns: Sequence[int]) -> Corrective:
-    """The function with some inputs held at the middle of their range, whatever they are."""
-    return replace(function, scale=function.scale.at[np.array(columns, dtype=int)].set(jnp.inf))
