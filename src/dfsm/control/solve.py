@@ -19,7 +19,7 @@ from dfsm.control.nlp.shooting import MultipleShooting, Shooting, SingleShooting
 from dfsm.control.nlp.transcription import DirectTranscription, Transcription, node_data
 from dfsm.control.problem import OptimalControlProblem, level
 from dfsm.control.replay import replay
-from dfsm.control.solution import RATE, Ending, Solution
+from dfsm.control.solution import HELD, RATE, Ending, Solution
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError
@@ -30,6 +30,7 @@ Method = DirectTranscription | MultipleShooting | SingleShooting
 _ENDINGS = {
     "solved": Ending.SOLVED,
     "acceptable": Ending.ACCEPTABLE,
+    "stalled": Ending.STALLED,
     "infeasible": Ending.INFEASIBLE,
     "limit": Ending.LIMIT,
     "interrupted": Ending.INTERRUPTED,
@@ -37,8 +38,10 @@ _ENDINGS = {
     "failed": Ending.FAILED,
 }
 
+# Endings before the tolerance is met: they count only as far as the measured conditions hold.
+_EARLY = (Ending.ACCEPTABLE, Ending.STALLED)
 # Outcomes of the solver that can be built on.
-_GOOD = ("solved", "acceptable")
+_GOOD = ("solved", "acceptable", "stalled")
 # Objectives that are smaller than 1 by this factor are scaled up, by no more than the second.
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Scaled violations up to which a start counts as close to a solution.
@@ -149,7 +152,7 @@ def _solve_meshes(
     near, multipliers = isinstance(guess, Solution), None
     if isinstance(guess, Solution) and np.array_equal(guess.grid.edges, grid.edges):
         multipliers = guess.solver_state
-    record = _Record()
+    record = _Record(method.tolerance)
     # What direct transcription has and shooting has not.
     refine = method.refine if isinstance(method, DirectTranscription) else None
     rounds = method.most_refinements if isinstance(method, DirectTranscription) else 0
@@ -244,7 +247,8 @@ def _solve_once(
 class _Record:
     """What happened on every mesh."""
 
-    def __init__(self) -> None:
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance = tolerance
         self.compile = self.solve = 0.0
         self.meshes: list[dict[str, Any]] = []
         self.iterations = 0
@@ -280,9 +284,7 @@ class _Record:
 def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -> Solution:
     shot, outcome, start = record.shot, record.outcome, record.start
     program, z = shot.program, outcome.z
-    ending = _ENDINGS[outcome.ending]
-    if ending is Ending.SOLVED and record.coarse:
-        ending = Ending.COARSE
+    ending = _ending(record)
     final_cost = float(program.blocks[1].c @ program.outputs(z)[1].ravel())
     objective = program.cost(z)
     trajectories = trajectories_of(problem, shot.tau, start)
@@ -293,7 +295,7 @@ def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -
     return Solution(
         name=problem.name,
         ending=ending,
-        reason="" if ending.solved else _reason(shot, outcome),
+        reason=_reason(shot, outcome, ending),
         objective=objective,
         final_cost=final_cost,
         integral_cost=objective - final_cost,
@@ -312,11 +314,30 @@ def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -
         replays=replays,
         bounds=_bounds(shot, trajectories[0].time),
         solver_state=outcome.multipliers,
+        optimality=outcome.optimality,
     )
 
 
-def _reason(shot: Shot, outcome: Outcome) -> str:
-    program, z = shot.program, outcome.z
+def _ending(record: _Record) -> Ending:
+    """What the solver says, as far as the measured optimality conditions bear it out."""
+    ending, measured = _ENDINGS[record.outcome.ending], record.outcome.optimality
+    if ending is Ending.SOLVED and record.coarse:
+        return Ending.COARSE
+    if ending in _EARLY and not measured.held(record.tolerance):
+        return Ending.INACCURATE
+    return ending
+
+
+def _reason(shot: Shot, outcome: Outcome, ending: Ending) -> str:
+    program, z, measured = shot.program, outcome.z, outcome.optimality
+    if ending in _EARLY:
+        return f"the optimality conditions hold to {measured.worst:.2g}"
+    if ending is Ending.INACCURATE:
+        why = "steps became too small" if outcome.ending == "stalled" else "the solver ended early"
+        text = f"{why} where the optimality conditions hold to {measured.worst:.2g} only"
+        return f"{text}, {conflict(program, z)}" if measured.violation > HELD else text
+    if ending.solved:
+        return ""
     if outcome.ending == "not finite":
         try:
             require_finite(program, z, node_times(shot), output_names(shot), "the last iterate")
