@@ -42,7 +42,7 @@ _ENDINGS = {
 _EARLY = (Ending.ACCEPTABLE, Ending.STALLED)
 # Outcomes of the solver that can be built on.
 _GOOD = ("solved", "acceptable", "stalled")
-# Objectives that are smaller than 1 by this factor are scaled up, by no more than the second.
+# Objectives that vary by less than 1, by this factor, are scaled up, by no more than the second.
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Scaled violations up to which a start counts as close to a solution.
 _NEAR = 1e-2
@@ -207,15 +207,18 @@ def _prepare(shot: Shot, z: Array) -> None:
 def _solve_scaled(
     program: Program, z: Array, settings: SolverSettings, multipliers: Array | None
 ) -> Outcome:
-    """Solve, and again if the objective turns out to be so small that tolerances hide it."""
+    """Solve, and again if the objective turns out to vary so little that tolerances hide it.
+
+    Its value does not matter: a constant may be part of it.
+    """
     scale = program.objective_scale
     first = _solve_once(program, z, settings, multipliers)
     if settings.warm and first.ending not in (*_GOOD, "interrupted"):
         # What looked close was not: start afresh from the same point.
         first = _solve_once(program, z, replace(settings, warm=False), None)
-    value = abs(program.cost(first.z))
-    wanted = min(1 / max(value, 1e-300), _MOST_SCALE)
-    if first.ending not in _GOOD or value == 0 or wanted < _CLEARLY * scale:
+    variation = program.variation(first.z)
+    wanted = min(1 / max(variation, 1e-300), _MOST_SCALE)
+    if first.ending not in _GOOD or variation == 0 or wanted < _CLEARLY * scale:
         return first
     program.objective_scale = wanted
     second = _solve_once(program, first.z, replace(settings, warm=True), first.multipliers)
