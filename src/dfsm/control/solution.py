@@ -16,6 +16,8 @@ from dfsm.errors import printable
 
 # Before the name of a control in `Solution.bounds`: bounds of its rate.
 RATE = "rate of "
+# Scaled optimality conditions that hold to this count as held, or to the tolerance if that is more.
+HELD = 1e-6
 
 
 class Ending(enum.Enum):
@@ -25,6 +27,14 @@ class Ending(enum.Enum):
     ACCEPTABLE = (
         "solved to a looser tolerance than asked, because no step improved it: check the scaling "
         "of bounds and costs, or loosen tolerance"
+    )
+    STALLED = (
+        "solved as far as the steps went, which became too small: check the scaling of bounds and "
+        "costs, or loosen tolerance"
+    )
+    INACCURATE = (
+        "not solved, and no step improved it: replace kinks in costs and constraints by smooth "
+        "functions, check the scaling of bounds and costs, or start from another guess"
     )
     COARSE = (
         "solved on the last mesh, whose local error is still above what was asked: raise "
@@ -50,8 +60,40 @@ class Ending(enum.Enum):
 
     @property
     def solved(self) -> bool:
-        """Whether the result satisfies the optimality conditions on its mesh."""
-        return self in (Ending.SOLVED, Ending.ACCEPTABLE, Ending.COARSE)
+        """Whether the result satisfies the optimality conditions on its mesh.
+
+        `ACCEPTABLE` and `STALLED` are only told where the conditions were measured and hold to
+        1e-6, or to the tolerance if that is looser; else the ending is `INACCURATE`.
+        """
+        return self in (Ending.SOLVED, Ending.ACCEPTABLE, Ending.STALLED, Ending.COARSE)
+
+
+@dataclass(frozen=True)
+class Optimality:
+    """How well the optimality conditions of the scaled nonlinear program hold; 0 is exactly.
+
+    Attributes
+    ----------
+    stationarity
+        Largest slope of the Lagrangian, relative to that of the objective where it is above 1.
+    violation
+        Largest violation of a constraint or bound, relative to its size.
+    complementarity
+        Largest product of a multiplier and the distance to its limit, relative as the slope.
+    """
+
+    stationarity: float
+    violation: float
+    complementarity: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three; NaN where one is."""
+        return float(np.max([self.stationarity, self.violation, self.complementarity]))
+
+    def held(self, tolerance: float) -> bool:
+        """Whether all three hold to 1e-6, or to the tolerance if that is looser."""
+        return self.worst <= max(HELD, tolerance)
 
 
 @dataclass(frozen=True)
@@ -75,7 +117,7 @@ class Replay:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What `solve` found.
+    """Optimal trajectories, or the best that a solve came to.
 
     Attributes
     ----------
@@ -85,7 +127,8 @@ class Solution:
         How the solver ended.
     reason
         For a solve that did not succeed: the worst constraint by name and time, and the bounds
-        that hold it; else "".
+        that hold it; for one that ended before its tolerance was met: how well the conditions
+        hold; else "".
     objective, final_cost, integral_cost
         M + ∫ L dt and its two parts, weighted over the scenarios.
     trajectories
@@ -123,6 +166,9 @@ class Solution:
         ``"rate of …"``.
     solver_state
         Scaled multipliers, to start the same mesh warm.
+    optimality
+        How well the optimality conditions hold at the result; None for a solution saved by a
+        version that did not measure it.
     """
 
     name: str
@@ -146,6 +192,7 @@ class Solution:
     replays: tuple[Replay, ...] = ()
     bounds: Mapping[str, Array] = field(default_factory=dict)
     solver_state: Array = field(default_factory=lambda: np.empty(0))
+    optimality: Optimality | None = None
 
     def __repr__(self) -> str:
         t = self.trajectory
@@ -205,6 +252,13 @@ class Solution:
             f"{self.seconds['solve']:.2f} s to solve"
             + (", linear-quadratic" if self.linear_quadratic else ""),
         ]
+        if self.optimality is not None:
+            held = self.optimality
+            lines.append(
+                f"optimality conditions hold to {held.worst:.2g}: stationarity "
+                f"{held.stationarity:.2g}, violation {held.violation:.2g}, complementarity "
+                f"{held.complementarity:.2g}"
+            )
         for mesh in self.meshes if len(self.meshes) > 1 else ():
             lines.append(
                 f"  {mesh['intervals']} intervals: objective {mesh['objective']:.10g}, local error "

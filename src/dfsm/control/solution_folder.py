@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from dfsm.control.mesh.grid import Grid
-from dfsm.control.solution import Ending, Replay, Solution
+from dfsm.control.solution import Ending, Optimality, Replay, Solution
 from dfsm.core.bundle import MANIFEST, Bundle
 from dfsm.core.files import check_folder
 from dfsm.core.types import Array
@@ -61,8 +61,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "solver_state": solution.solver_state,
     }
     for group in ("multipliers", "bounds"):
-        found = getattr(solution, group)
-        tensors |= {f"{group}/{n}": np.asarray(v) for n, v in found.items()}
+        arrays = getattr(solution, group)
+        tensors |= {f"{group}/{n}": np.asarray(v) for n, v in arrays.items()}
     content = {key: getattr(solution, key) for key in _PLAIN}
     content |= {
         "ending": solution.ending.name,
@@ -72,6 +72,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "replays": _apart("replays", [r.trajectory for r in solution.replays], tensors),
         "deviations": [[dict(r.deviation), r.relative] for r in solution.replays],
     }
+    if solution.optimality is not None:
+        content["optimality"] = asdict(solution.optimality)
     _BUNDLE.write(path, tensors, content, _is_solution)
 
 
@@ -118,6 +120,7 @@ def load_solution(path: str | Path) -> Solution:
             bounds=_group("bounds/", tensors),
             replays=tuple(replays),
             solver_state=tensors["solver_state"],
+            optimality=_optimality(manifest),
         )
     except (KeyError, TypeError, ValueError, ValidationError) as error:
         raise _BUNDLE.damaged(
@@ -147,6 +150,14 @@ def _together(
         )
         for k, told in enumerate(manifest[group])
     ]
+
+
+def _optimality(manifest: Mapping[str, Any]) -> Optimality | None:
+    """What was measured; folders of version 0.1 hold none."""
+    measured = manifest.get("optimality")
+    if measured is None:
+        return None
+    return Optimality(**{k: np.nan if v is None else float(v) for k, v in measured.items()})
 
 
 def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:

@@ -19,7 +19,7 @@ from dfsm.control.nlp.shooting import MultipleShooting, Shooting, SingleShooting
 from dfsm.control.nlp.transcription import DirectTranscription, Transcription, node_data
 from dfsm.control.problem import OptimalControlProblem, level
 from dfsm.control.replay import replay
-from dfsm.control.solution import RATE, Ending, Solution
+from dfsm.control.solution import HELD, RATE, Ending, Solution
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError
@@ -30,6 +30,7 @@ Method = DirectTranscription | MultipleShooting | SingleShooting
 _ENDINGS = {
     "solved": Ending.SOLVED,
     "acceptable": Ending.ACCEPTABLE,
+    "stalled": Ending.STALLED,
     "infeasible": Ending.INFEASIBLE,
     "limit": Ending.LIMIT,
     "interrupted": Ending.INTERRUPTED,
@@ -37,9 +38,11 @@ _ENDINGS = {
     "failed": Ending.FAILED,
 }
 
+# Endings before the tolerance is met: they count only as far as the measured conditions hold.
+_EARLY = (Ending.ACCEPTABLE, Ending.STALLED)
 # Outcomes of the solver that can be built on.
-_GOOD = ("solved", "acceptable")
-# Objectives that are smaller than 1 by this factor are scaled up, by no more than the second.
+_GOOD = ("solved", "acceptable", "stalled")
+# Objectives that vary by less than 1, by this factor, are scaled up, by no more than the second.
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Scaled violations up to which a start counts as close to a solution.
 _NEAR = 1e-2
@@ -149,7 +152,7 @@ def _solve_meshes(
     near, multipliers = isinstance(guess, Solution), None
     if isinstance(guess, Solution) and np.array_equal(guess.grid.edges, grid.edges):
         multipliers = guess.solver_state
-    record = _Record()
+    record = _Record(method.tolerance)
     # What direct transcription has and shooting has not.
     refine = method.refine if isinstance(method, DirectTranscription) else None
     rounds = method.most_refinements if isinstance(method, DirectTranscription) else 0
@@ -204,15 +207,18 @@ def _prepare(shot: Shot, z: Array) -> None:
 def _solve_scaled(
     program: Program, z: Array, settings: SolverSettings, multipliers: Array | None
 ) -> Outcome:
-    """Solve, and again if the objective turns out to be so small that tolerances hide it."""
+    """Solve, and again if the objective turns out to vary so little that tolerances hide it.
+
+    Its value does not matter: a constant may be part of it.
+    """
     scale = program.objective_scale
     first = _solve_once(program, z, settings, multipliers)
     if settings.warm and first.ending not in (*_GOOD, "interrupted"):
         # What looked close was not: start afresh from the same point.
         first = _solve_once(program, z, replace(settings, warm=False), None)
-    value = abs(program.cost(first.z))
-    wanted = min(1 / max(value, 1e-300), _MOST_SCALE)
-    if first.ending not in _GOOD or value == 0 or wanted < _CLEARLY * scale:
+    variation = program.variation(first.z)
+    wanted = min(1 / max(variation, 1e-300), _MOST_SCALE)
+    if first.ending not in _GOOD or variation == 0 or wanted < _CLEARLY * scale:
         return first
     program.objective_scale = wanted
     second = _solve_once(program, first.z, replace(settings, warm=True), first.multipliers)
@@ -244,7 +250,8 @@ def _solve_once(
 class _Record:
     """What happened on every mesh."""
 
-    def __init__(self) -> None:
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance = tolerance
         self.compile = self.solve = 0.0
         self.meshes: list[dict[str, Any]] = []
         self.iterations = 0
@@ -280,9 +287,7 @@ class _Record:
 def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -> Solution:
     shot, outcome, start = record.shot, record.outcome, record.start
     program, z = shot.program, outcome.z
-    ending = _ENDINGS[outcome.ending]
-    if ending is Ending.SOLVED and record.coarse:
-        ending = Ending.COARSE
+    ending = _ending(record)
     final_cost = float(program.blocks[1].c @ program.outputs(z)[1].ravel())
     objective = program.cost(z)
     trajectories = trajectories_of(problem, shot.tau, start)
@@ -293,7 +298,7 @@ def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -
     return Solution(
         name=problem.name,
         ending=ending,
-        reason="" if ending.solved else _reason(shot, outcome),
+        reason=_reason(shot, outcome, ending),
         objective=objective,
         final_cost=final_cost,
         integral_cost=objective - final_cost,
@@ -312,11 +317,30 @@ def _solution(problem: OptimalControlProblem, record: _Record, simulate: bool) -
         replays=replays,
         bounds=_bounds(shot, trajectories[0].time),
         solver_state=outcome.multipliers,
+        optimality=outcome.optimality,
     )
 
 
-def _reason(shot: Shot, outcome: Outcome) -> str:
-    program, z = shot.program, outcome.z
+def _ending(record: _Record) -> Ending:
+    """What the solver says, as far as the measured optimality conditions bear it out."""
+    ending, measured = _ENDINGS[record.outcome.ending], record.outcome.optimality
+    if ending is Ending.SOLVED and record.coarse:
+        return Ending.COARSE
+    if ending in _EARLY and not measured.held(record.tolerance):
+        return Ending.INACCURATE
+    return ending
+
+
+def _reason(shot: Shot, outcome: Outcome, ending: Ending) -> str:
+    program, z, measured = shot.program, outcome.z, outcome.optimality
+    if ending in _EARLY:
+        return f"the optimality conditions hold to {measured.worst:.2g}"
+    if ending is Ending.INACCURATE:
+        why = "steps became too small" if outcome.ending == "stalled" else "the solver ended early"
+        text = f"{why} where the optimality conditions hold to {measured.worst:.2g} only"
+        return f"{text}, {conflict(program, z)}" if measured.violation > HELD else text
+    if ending.solved:
+        return ""
     if outcome.ending == "not finite":
         try:
             require_finite(program, z, node_times(shot), output_names(shot), "the last iterate")

@@ -65,6 +65,7 @@ def _outcome(s: Solution) -> Table:
         (f"intervals ({s.grid.kind.replace('_', '–')})", s.grid.intervals),
         ("largest local error", s.error),
         ("largest violation of a constraint, relative", s.violation),
+        *_optimality(s),
         ("iterations", s.iterations),
         ("time to compile (s)", s.seconds["compile"]),
         ("time to solve (s)", s.seconds["solve"]),
@@ -72,6 +73,16 @@ def _outcome(s: Solution) -> Table:
     if s.outside is not None:
         rows.append(("outside the training range (% of the horizon)", 100 * s.outside))
     return Table("outcome", "How the solve ended", ("what", "value"), tuple(rows), digits=6)
+
+
+def _optimality(s: Solution) -> list[tuple[str, str | float | None]]:
+    """Rows on the optimality conditions, where they were measured."""
+    if s.optimality is None:
+        return []
+    return [
+        ("slope of the Lagrangian, scaled", s.optimality.stationarity),
+        ("complementarity, scaled", s.optimality.complementarity),
+    ]
 
 
 def _scenario(s: Solution, k: int, count: int) -> Section:

@@ -15,14 +15,17 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.control.nlp.optimality import optimality
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.watch import Watch
+from dfsm.control.solution import Optimality
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 
 # Names that IPOPT gives its outcomes, in groups that ask for the same action.
 _SOLVED = ("Solve_Succeeded", "Feasible_Point_Found")
-_ACCEPTABLE = ("Solved_To_Acceptable_Level", "Search_Direction_Becomes_Too_Small")
+_ACCEPTABLE = ("Solved_To_Acceptable_Level",)
+_STALLED = ("Search_Direction_Becomes_Too_Small",)
 _INFEASIBLE = ("Infeasible_Problem_Detected", "Not_Enough_Degrees_Of_Freedom")
 _LIMIT = ("Maximum_Iterations_Exceeded", "Maximum_CpuTime_Exceeded", "Maximum_WallTime_Exceeded")
 _STOPPED = ("User_Requested_Stop",)
@@ -31,7 +34,7 @@ _NOT_FINITE = ("Invalid_Number_Detected",)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the solver found.
+    """Where the solver ended, and how.
 
     Attributes
     ----------
@@ -40,10 +43,10 @@ class Outcome:
     multipliers, bound_multipliers
         Of scaled constraints and of scaled variables.
     ending
-        ``"solved"``, ``"acceptable"``, ``"infeasible"``, ``"limit"``, ``"interrupted"``,
-        ``"not finite"`` or ``"failed"``.
-    word
-        The solver's own name of it.
+        ``"solved"``, ``"acceptable"``, ``"stalled"``, ``"infeasible"``, ``"limit"``,
+        ``"interrupted"``, ``"not finite"`` or ``"failed"``: what the solver says.
+    optimality
+        How well the conditions hold at `z`: what is measured.
     iterations
         Steps taken.
     seconds
@@ -54,7 +57,7 @@ class Outcome:
     multipliers: Array
     bound_multipliers: Array
     ending: str
-    word: str
+    optimality: Optimality
     iterations: int
     seconds: float
 
@@ -115,13 +118,13 @@ def solve_nlp(
         begin = clock.perf_counter()
         limits = {"lbx": program.lower, "ubx": program.upper}
         limits |= {"lbg": program.g_lower, "ubg": program.g_upper}
-        given = {} if multipliers is None else {"lam_g0": multipliers}
-        found = solver(x0=start, **limits, **given)
+        first = {} if multipliers is None else {"lam_g0": multipliers}
+        last = solver(x0=start, **limits, **first)
     if watch.error is not None:
         raise watch.error
     stats = solver.stats()
     ending = _ending(stats["return_status"])
-    z, lam_g, lam_x = (np.array(found[k]).ravel() for k in ("x", "lam_g", "lam_x"))
+    z, lam_g, lam_x = (np.array(last[k]).ravel() for k in ("x", "lam_g", "lam_x"))
     if ending in ("interrupted", "limit", "not finite", "failed") and watch.best is not None:
         z, lam_g, lam_x = watch.best
     return Outcome(
@@ -129,7 +132,7 @@ def solve_nlp(
         lam_g,
         lam_x,
         ending,
-        stats["return_status"],
+        optimality(program, z, lam_g, lam_x),
         int(stats["iter_count"]),
         clock.perf_counter() - begin,
     )
@@ -150,6 +153,7 @@ def _ending(word: str) -> str:
     for ending, words in (
         ("solved", _SOLVED),
         ("acceptable", _ACCEPTABLE),
+        ("stalled", _STALLED),
         ("infeasible", _INFEASIBLE),
         ("limit", _LIMIT),
         ("interrupted", _STOPPED),

@@ -4,8 +4,8 @@
 
 Everything that depends on a scheme is in G₀, G and c; everything nonlinear is in the terms. The
 Jacobian and the Hessian of the Lagrangian are then sparse matrices times the terms' small dense
-derivatives, with a structure that is found once. Variables and rows are scaled inside; what goes
-in and comes out of `Program.physical` is in the model's units.
+derivatives, with a structure that is worked out once. Variables and rows are scaled inside; what
+goes in and comes out of `Program.physical` is in the model's units.
 """
 
 from __future__ import annotations
@@ -196,13 +196,25 @@ class Program:
 
     def gradient(self, z: Array) -> Array:
         """Return ∂f/∂z, scaled, shape ``(variable,)``."""
-        found = zip(self._gradients, self._derivatives(z), strict=True)
-        return self.objective_scale * sum((M @ J for M, J in found), np.zeros(self.n))
+        return self.objective_scale * self._slopes(z)
+
+    def variation(self, z: Array) -> float:
+        """How far f in physical units moves if variables move by their own values, to first order.
+
+        Σ |zᵢ ∂f/∂zᵢ| over the variables that can move: twice the value of a quadratic cost, and the
+        same whatever constant is added to it.
+        """
+        moves = self.lower < self.upper
+        return float(np.abs(z * self._slopes(z))[moves].sum())
+
+    def _slopes(self, z: Array) -> Array:
+        parts = zip(self._gradients, self._derivatives(z), strict=True)
+        return sum((M @ J for M, J in parts), np.zeros(self.n))
 
     def jacobian(self, z: Array) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_pattern`."""
-        found = zip(self._jacobians, self._derivatives(z), strict=True)
-        return sum((M @ J for M, J in found), self._jacobian_fixed)
+        parts = zip(self._jacobians, self._derivatives(z), strict=True)
+        return sum((M @ J for M, J in parts), self._jacobian_fixed)
 
     def hessian(self, z: Array, sigma: float, multipliers: Array) -> Array:
         """Upper triangle of ∂²(σ f + λᵀ g)/∂z² in the order of `hessian_pattern`."""

@@ -16,7 +16,7 @@ import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.control.names import End, Signals
-from dfsm.control.nlp.structure import varies
+from dfsm.control.nlp.structure import dependent, varies
 from dfsm.control.problem import OptimalControlProblem, is_number
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
@@ -125,8 +125,9 @@ class Functions:
         # Kept alive, so that its id is not given to another while this is remembered.
         self.model, self.plant = problem.model, problem.plant
         self.nx, self.nu = (len(self.plant.names(g)) for g in ("states", "controls"))
-        names = self.plant.names("parameters")
-        self._free = np.array([names.index(n) for n in problem.free_parameters], dtype=int)
+        # Where a parameter stands among the free ones; None for a fixed one.
+        free = problem.free_parameters
+        self._free = [free.index(n) if n in free else None for n in self.plant.names("parameters")]
         self._timed = problem.free_time is not None
         self._cost, self._final_cost = problem.cost, problem.final_cost
         self._path = {n: c[0] for n, c in problem.constraints.items()}
@@ -141,8 +142,9 @@ class Functions:
     def unpack(self, q: jax.Array, common: Any) -> tuple[jax.Array, jax.Array]:
         """Parameters and the last time from free ones and the fixed values."""
         p = jnp.asarray(common["p"])
-        if len(self._free):
-            p = p.at[self._free].set(q[: len(self._free)])
+        if any(k is not None for k in self._free):
+            # Put together value by value: one that stays fixed then depends on no free one.
+            p = jnp.stack([p[i] if k is None else q[k] for i, k in enumerate(self._free)])
         return p, q[-1] if self._timed else common["stop"]
 
     def disturbances(self, t: jax.Array, data: Any, common: Any) -> jax.Array:
@@ -188,10 +190,14 @@ class Functions:
         p, stop = self.unpack(q, common)
         return End(self.plant, common["start"], first, p), End(self.plant, stop, last, p)
 
-    def _ends_cost(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
+    def final_cost(self, z: jax.Array, common: Any) -> jax.Array:
+        """M at both ends, shape ``(1,)``."""
         if self._final_cost is None:
             return jnp.zeros(1)
         return scalar(self._final_cost, "the final cost", *self.end_pair(z, common))
+
+    def _ends_cost(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
+        return self.final_cost(z, common)
 
     def _ends_constraints(self, z: jax.Array, _data: Any, common: Any) -> jax.Array:
         ends = self.end_pair(z, common)
@@ -249,8 +255,9 @@ def vector(function: Callable[..., Any], what: str, *arguments: Any) -> jax.Arra
             f"{what} cannot be followed by JAX ({reason}): write it with jax.numpy, and jnp.where "
             "in place of if"
         ) from None
-    except TypeError as error:
-        raise DfsmError(f"{what} cannot be evaluated: {error}") from None
+    except (TypeError, ValueError) as error:
+        reason = str(error).split("\n")[0]
+        raise DfsmError(f"{what} cannot be evaluated: {reason}") from None
     return value.astype(jnp.float64).ravel()
 
 
@@ -266,52 +273,45 @@ def _sizes(
     functions: Functions, problem: OptimalControlProblem
 ) -> tuple[dict[str, int], dict[str, int]]:
     """Number of values of every path and boundary constraint; refuse those without an effect."""
-    example = example_of(functions, problem)
-    z, data, common = example["node"]
-    ends = example["ends"]
-
-    def node(function: Callable[..., Any], what: str) -> jax.Array:
-        return vector(function, what, functions.signals(z, data, common)[0])
-
-    def both(function: Callable[..., Any], what: str) -> jax.Array:
-        return vector(function, what, *functions.end_pair(ends, common))
-
-    path, boundary = {}, {}
-    for place, call, sizes in (("constraints", node, path), ("boundary", both, boundary)):
-        for name, (function, *_) in getattr(problem, place).items():
-            # What does not become NaN when all that can be chosen is NaN depends on nothing.
-            value = np.asarray(call(function, f"{place} '{name}'"))
-            fixed = np.flatnonzero(~np.isnan(value))
-            if len(fixed) or not value.size:
-                which = f"value {fixed[0]} of " if value.size > 1 else ""
-                raise DfsmError(
-                    f"{problem.name}: {which}{place} '{name}' depends on nothing that can be "
-                    "chosen: leave it out, or use a state, control or free parameter in it"
-                )
-            sizes[name] = value.size
-    path |= {name: 1 for name in functions._outputs}
-    if problem.cost:
-        scalar(problem.cost, "the cost", functions.signals(z, data, common)[0])
-    if problem.final_cost:
-        scalar(problem.final_cost, "the final cost", *functions.end_pair(ends, common))
-    return path, boundary
-
-
-def example_of(functions: Functions, problem: OptimalControlProblem) -> dict[str, Any]:
-    """Arguments of a node and of the ends in which all that can be chosen is NaN."""
     common = common_of(problem)
     extra = len(problem.free_parameters) + (problem.free_time is not None)
     data = {"tau": jnp.array(0.5), "scenario": 0}
     data["w"] = jnp.ones(len(problem.plant.names("disturbances")))
-    node = jnp.full(functions.nx + functions.nu + extra, jnp.nan)
-    ends = jnp.full(2 * functions.nx + extra, jnp.nan)
-    return {"node": (node, data, common), "ends": ends}
+    # All that can be chosen at a node, and at the ends.
+    z, ends = jnp.ones(functions.nx + functions.nu + extra), jnp.ones(2 * functions.nx + extra)
+
+    def node(function: Callable[..., Any], what: str) -> Callable[[jax.Array], jax.Array]:
+        return lambda z: vector(function, what, functions.signals(z, data, common)[0])
+
+    def both(function: Callable[..., Any], what: str) -> Callable[[jax.Array], jax.Array]:
+        return lambda z: vector(function, what, *functions.end_pair(z, common))
+
+    path, boundary = {}, {}
+    for place, local, at, sizes in (
+        ("constraints", node, z, path),
+        ("boundary", both, ends, boundary),
+    ):
+        for name, (function, *_) in getattr(problem, place).items():
+            (depends,) = dependent(local(function, f"{place} '{name}'"), at)
+            if not (depends.size and depends.all()):
+                which = f"value {np.argmin(depends)} of " if depends.size > 1 else ""
+                raise DfsmError(
+                    f"{problem.name}: {which}{place} '{name}' depends on nothing that can be "
+                    "chosen: leave it out, or use a state, control or free parameter in it"
+                )
+            sizes[name] = depends.size
+    path |= {name: 1 for name in functions._outputs}
+    if problem.cost:
+        jax.eval_shape(lambda z: functions.integrand(functions.signals(z, data, common)[0]), z)
+    if problem.final_cost:
+        jax.eval_shape(lambda z: functions.final_cost(z, common), ends)
+    return path, boundary
 
 
 def common_of(problem: OptimalControlProblem) -> dict[str, Array]:
     """Numbers that all nodes share: fixed parameters, horizon, table of disturbances."""
-    given = (problem.parameters[n] for n in problem.plant.names("parameters"))
-    fixed = [float(v) if is_number(v) else np.nan for v in given]
+    levels = (problem.parameters[n] for n in problem.plant.names("parameters"))
+    fixed = [float(v) if is_number(v) else np.nan for v in levels]
     common = {
         "p": np.array(fixed, dtype=np.float64),
         "start": np.float64(problem.start),
