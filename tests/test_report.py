@@ -238,6 +238,13 @@ def test_thinning_takes_irregular_meshes():
     assert abs(values[:, 0] - np.sin(mesh))[10:-10].max() < 0.1
 
 
+def test_thinning_does_not_stretch_rounded_times():
+    # The steps are 0.013 and 0.014 s, the median is neither their mean nor the true step.
+    time = np.round(0.0132 * np.arange(20001), 3)
+    start, step, values = thin(Trajectory(time, time[:, None], (Channel("x"),)))
+    assert start + step * (len(values) - 1) == pytest.approx(time[-1], abs=step)
+
+
 def test_incomplete_rollouts_are_told_and_not_scored(page):
     rows = page.rows("Channel", "Unit", "Role")[1]
     assert all(cell == "—a" for row in rows for cell in row[6:9])

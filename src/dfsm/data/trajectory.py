@@ -140,7 +140,7 @@ class Trajectory:
 
     @cached_property
     def time_step(self) -> float | None:
-        """Sampling interval in s if the mesh is equidistant (to 1e-6 of a step), else None."""
+        """Sampling interval in s if the mesh is equidistant to rounding, else None."""
         return time_step(self.time)
 
     def __len__(self) -> int:

@@ -11,6 +11,7 @@ from scipy.signal import welch
 
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
+from dfsm.numerics.time_mesh import time_step
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,8 @@ def spectrum(time: Array, values: Array, segment: float = 200.0) -> Spectrum:
     DfsmError
         The mesh is not equidistant.
     """
-    steps = np.diff(time)
-    step = float(steps.mean())
-    if np.ptp(steps) > 1e-3 * step:
+    step = time_step(time)
+    if step is None:
         raise DfsmError("a spectrum needs an equidistant time mesh: resample the run first")
     size = min(len(values), round(segment / step))
     frequency, density = welch(values, fs=1 / step, window="hann", nperseg=size)

@@ -6,10 +6,52 @@ import numpy as np
 
 from dfsm.core.types import Array
 
+# Share of a step by which times may miss a straight line: of no weight for filters and spectra.
+_SHARE = 1e-3
+# Rounding that is coarser than this share of a step hides whether a mesh is equidistant.
+_COARSE = 0.1
+_MOST_DECIMALS = 8
+
 
 def time_step(time: Array) -> float | None:
-    """Sampling interval in s if a mesh is equidistant (to 1e-6 of a step), else None."""
-    steps = np.diff(time)
-    # A file's times carry rounding of their own, which grows with the time itself.
-    slack = 1e-6 * steps.mean() + 4 * np.spacing(np.abs(time).max())
-    return float(steps.mean()) if np.ptp(steps) <= slack else None
+    """Sampling interval of an equidistant mesh; the one definition of equidistant.
+
+    All times lie on the straight line from the first to the last, within a thousandth of a step or
+    within the rounding of the times themselves: that of single precision, or of the last decimal
+    that any of them has, as files write them. A missing sample or a drifting clock is neither.
+
+    Parameters
+    ----------
+    time
+        Strictly increasing times in s, shape ``(time,)``, at least two.
+
+    Returns
+    -------
+    float or None
+        Mean step in s; None where the mesh is not equidistant.
+    """
+    last = len(time) - 1
+    step = float((time[-1] - time[0]) / last)
+    # Not as time[0] + step * index: the error of a step would grow with the index.
+    line = time[0] + (time[-1] - time[0]) * (np.arange(last + 1) / last)
+    error = float(np.abs(time - line).max())
+    slack = 4 * float(np.spacing(np.abs(time).max()))
+    if error <= max(_SHARE * step, slack):
+        return step
+    # Both ends and the time between may each be half a unit off.
+    return step if error <= _rounding(time, step) + slack else None
+
+
+def _rounding(time: Array, step: float) -> float:
+    """Unit in s to which the times of an equidistant mesh seem to be rounded; 0 for none."""
+    largest, most = np.abs(time).max(), _COARSE * step
+    single = float(np.spacing(np.float32(largest)))
+    if single <= most and np.array_equal(time.astype(np.float32), time):
+        return single
+    slack = 4 * np.spacing(largest)
+    for decimals in range(_MOST_DECIMALS + 1):
+        unit = 10.0**-decimals
+        if unit <= most and np.abs(np.round(time, decimals) - time).max() <= slack:
+            # Whole multiples of the unit would not have been rounded.
+            return 0.0 if round((time[-1] - time[0]) / unit) % (len(time) - 1) == 0 else unit
+    return 0.0

@@ -80,8 +80,9 @@ def thin(run: Trajectory) -> tuple[float, float, Array]:
         First time and step in s, samples of shape ``(time, channel)``.
     """
     time, values = run.time, run.values
-    step = float(np.median(np.diff(time)))
-    if run.time_step is None:
+    step = run.time_step
+    if step is None:
+        step = float(np.median(np.diff(time)))
         mesh = np.arange(time[0], time[-1] + step / 2, step)
         values = np.stack([np.interp(mesh, time, v) for v in values.T], axis=1)
     factor = max(round(_STEP / step), -(-len(values) // _MOST_POINTS), 1)
