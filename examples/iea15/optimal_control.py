@@ -21,7 +21,8 @@ from dfsm.core.workers import processors
 from dfsm.errors import hushed
 from dfsm.report.publish import publish
 from turbine_article import control_article
-from turbine_control import ControlStudy, Region, study
+from turbine_control import ControlStudy, study
+from turbine_problem import Region
 
 # Winds (m/s, as in the file names) and the seeds to optimize for: two in the transition region,
 # one below and one above it.

@@ -7,7 +7,8 @@ from itertools import pairwise
 
 from dfsm.report.article import Article, Figure, Section, Table, cell_text, listed
 from dfsm.report.control_figures import stacked_figure
-from turbine_control import (
+from turbine_control import ControlStudy, Result
+from turbine_problem import (
     BEST_COEFFICIENT,
     BLADE,
     MOMENT,
@@ -16,8 +17,6 @@ from turbine_control import (
     SPEED,
     TORQUE,
     WIND,
-    ControlStudy,
-    Result,
     mean_power,
     wind_power,
 )
