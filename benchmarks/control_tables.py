@@ -17,13 +17,13 @@ def codesign_table(figures: Mapping[str, Any]) -> list[str]:
         "more by | arm misses its end by |",
         "|---|---|---|---|---|---|",
     ]
-    for seed, found in figures["codesign"].items():
+    for seed, study in figures["codesign"].items():
         cells = [
-            str(found["runs"]),
-            f"{found['mass']:.3f} / {found['true_mass']:.3f} kg",
-            f"{found['cost']:.4f} / {found['true_cost']:.4f}",
-            f"{100 * found['loss']:.2g} %",
-            f"{max(found['miss']['theta1'], found['miss']['theta2']):.2g} rad",
+            str(study["runs"]),
+            f"{study['mass']:.3f} / {study['true_mass']:.3f} kg",
+            f"{study['cost']:.4f} / {study['true_cost']:.4f}",
+            f"{100 * study['loss']:.2g} %",
+            f"{max(study['miss']['theta1'], study['miss']['theta2']):.2g} rad",
         ]
         lines.append(f"| {seed} | {' | '.join(cells)} |")
     return lines
@@ -36,15 +36,15 @@ def adaptive_table(figures: Mapping[str, Any]) -> list[str]:
         "| largest miss | truth | differences by round |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for seed, found in figures["adaptive"].items():
-        rounds = [None if d is None else 100 * d for d in found["differences"]]
+    for seed, study in figures["adaptive"].items():
+        rounds = [None if d is None else 100 * d for d in study["differences"]]
         cells = [
-            str(found["runs"]),
-            str(found["simulations"]) + ("" if found["status"] == "AGREED" else ", no agreement"),
-            f"{found['predicted']:.4f}",
-            f"{found['realised']:.4f} {found['price']:+.4f}".replace("-", "\N{MINUS SIGN}"),
-            f"{found['miss']:.1g}",
-            f"{found['true_cost']:.4f}",
+            str(study["runs"]),
+            str(study["simulations"]) + ("" if study["status"] == "AGREED" else ", no agreement"),
+            f"{study['predicted']:.4f}",
+            f"{study['realised']:.4f} {study['price']:+.4f}".replace("-", "\N{MINUS SIGN}"),
+            f"{study['miss']:.1g}",
+            f"{study['true_cost']:.4f}",
             ", ".join("–" if d is None else _percent(d) for d in rounds),
         ]
         lines.append(f"| {seed} | {' | '.join(cells)} |")
@@ -63,19 +63,19 @@ def known_table(figures: Mapping[str, Any]) -> list[str]:
         "multiple_shooting": "multiple shooting",
     }
     rows = [
-        (name, f"{found['value']:.10g}", *(_solved(found.get(key)) for key in methods))
-        for name, found in figures.items()
+        (name, f"{results['value']:.10g}", *(_solved(results.get(key)) for key in methods))
+        for name, results in figures.items()
     ]
     return Table("known", "", ("problem", "optimum", *methods.values()), _minus(rows)).markdown()
 
 
-def _solved(found: Mapping[str, Any] | None) -> str | None:
-    if found is None:
+def _solved(result: Mapping[str, Any] | None) -> str | None:
+    if result is None:
         return None
-    if found["ending"] != "SOLVED":
-        return found["ending"].lower().replace("_", " ")
-    error, seconds = cell_text(found["relative_error"], 2), cell_text(found["seconds"], 2)
-    return f"{error}, {found['iterations']}, {seconds} s"
+    if result["ending"] != "SOLVED":
+        return result["ending"].lower().replace("_", " ")
+    error, seconds = cell_text(result["relative_error"], 2), cell_text(result["seconds"], 2)
+    return f"{error}, {result['iterations']}, {seconds} s"
 
 
 def orders_table(figures: Mapping[str, Any]) -> list[str]:
@@ -83,24 +83,24 @@ def orders_table(figures: Mapping[str, Any]) -> list[str]:
     meshes = next(iter(figures.values()))["intervals"]
     steps = [f"{coarse} → {fine}" for coarse, fine in pairwise(meshes)]
     rows = []
-    for name, found in figures.items():
-        pairs = zip(found["orders"], found["errors"][1:], strict=True)
+    for name, result in figures.items():
+        pairs = zip(result["orders"], result["errors"][1:], strict=True)
         cells = [
-            f"{order:.2f}" if e > found["tolerance"] else f"({order:.2f})" for order, e in pairs
+            f"{order:.2f}" if e > result["tolerance"] else f"({order:.2f})" for order, e in pairs
         ]
         label = name.replace("hermite_simpson", "Hermite–Simpson").replace("radau", "Radau")
-        rows.append((label, str(found["theory"]), *cells))
+        rows.append((label, str(result["theory"]), *cells))
     return Table("orders", "", ("problem, scheme", "theory", *steps), _minus(rows)).markdown()
 
 
 def control_speed_table(figures: Mapping[str, Any]) -> list[str]:
     """Time per iteration over the number of points; the last column is 1 where it is linear."""
-    least, first = min((int(n), found["ms_per_iteration"]) for n, found in figures.items())
+    least, first = min((int(n), result["ms_per_iteration"]) for n, result in figures.items())
     rows = []
-    for count, found in figures.items():
-        points, ms = int(count), found["ms_per_iteration"]
+    for count, result in figures.items():
+        points, ms = int(count), result["ms_per_iteration"]
         growth = f"{points / least:.0f} × the points, {ms / first:.2g} × the time"
-        label = found["iterations"] if found["ending"] == "SOLVED" else found["ending"].lower()
+        label = result["iterations"] if result["ending"] == "SOLVED" else result["ending"].lower()
         rows.append((points, label, ms, 1000 * ms / points, "–" if points == least else growth))
     columns = ("points", "iterations", "ms per iteration", "ms per iteration per 1000 points")
     growth = f"against {least} points"
@@ -118,16 +118,16 @@ def expressions_table(figures: Mapping[str, Any]) -> list[str]:
     }
     reference, rows = figures["ms_per_iteration"]["dfsm"], []
     for key, name in names.items():
-        found = figures[key]
-        if found is None:
+        result = figures[key]
+        if result is None:
             continue
         start, solve = (
-            found.get(a, found.get(b))
+            result.get(a, result.get(b))
             for a, b in (("seconds_setup", "seconds_compile"), ("seconds_solve", "seconds"))
         )
-        ms = 1000 * solve / found["iterations"]
-        objective = f"{found['objective']:.4f}"
-        rows.append((name, objective, found["iterations"], start, solve, ms, ms / reference))
+        ms = 1000 * solve / result["iterations"]
+        objective = f"{result['objective']:.4f}"
+        rows.append((name, objective, result["iterations"], start, solve, ms, ms / reference))
     columns = (
         "program",
         "objective",

@@ -8,16 +8,16 @@ from typing import Any
 
 def accuracy_table(figures: Mapping[str, Any], variant: str = "multi-fidelity") -> list[str]:
     """Mean NRMSE per model and channel; a dash where a rollout ended early or has no such state."""
-    models = {label: found[variant] for label, found in figures.items()}
-    channels = list(dict.fromkeys(c for found in models.values() for c in found["nrmse"]))
+    models = {label: result[variant] for label, result in figures.items()}
+    channels = list(dict.fromkeys(c for result in models.values() for c in result["nrmse"]))
     lines = [
         "| model | rollouts completed | " + " | ".join(channels) + " |",
         "|---|---|" + "---|" * len(channels),
     ]
-    for label, found in models.items():
-        errors = [found["nrmse"].get(c) for c in channels]
+    for label, result in models.items():
+        errors = [result["nrmse"].get(c) for c in channels]
         cells = ["–" if v is None else f"{v:.2f}" for v in errors]
-        done = f"{found['completed']} of {found['of']}"
+        done = f"{result['completed']} of {result['of']}"
         lines.append(f"| {label} | {done} | " + " | ".join(cells) + " |")
     return lines
 
@@ -69,11 +69,11 @@ def parameters_table(figures: Mapping[str, Any]) -> list[str]:
     sets = next(iter(figures["errors"].values()))
     heads = [f"{where}, f̂ / rollout" for where in sets]
     lines = [f"| model | {' | '.join(heads)} |", "|---|" + "---|" * len(heads)]
-    for name, found in figures["errors"].items():
+    for name, errors in figures["errors"].items():
         cells = [
             f"{100 * e['derivative']:.2g} % / "
             + ("–" if e["rollout"] is None else f"{100 * e['rollout']:.2g} %")
-            for e in found.values()
+            for e in errors.values()
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
@@ -81,7 +81,7 @@ def parameters_table(figures: Mapping[str, Any]) -> list[str]:
 
 def scaling_table(figures: Mapping[str, Any]) -> list[str]:
     """Errors, then costs: a row per kind, a column per number of inputs."""
-    heads = [f"{found['inputs']} inputs" for found in figures.values()]
+    heads = [f"{size['inputs']} inputs" for size in figures.values()]
     kinds = list(next(iter(figures.values()))["results"])
     lines: list[str] = []
     for what, cell in (
@@ -90,18 +90,18 @@ def scaling_table(figures: Mapping[str, Any]) -> list[str]:
     ):
         lines += [f"| {what} | {' | '.join(heads)} |", "|---|" + "---|" * len(heads)]
         for kind in kinds:
-            cells = [cell(found["results"][kind]) for found in figures.values()]
+            cells = [cell(size["results"][kind]) for size in figures.values()]
             lines.append(f"| {kind} | {' | '.join(cells)} |")
         lines.append("")
     return lines[:-1]
 
 
-def _scaling_errors(found: Mapping[str, Any]) -> str:
-    rollout = "–" if found["rollout"] is None else f"{100 * found['rollout']:.2g} %"
-    return f"{100 * found['derivative']:.2g} % / {rollout}"
+def _scaling_errors(result: Mapping[str, Any]) -> str:
+    rollout = "–" if result["rollout"] is None else f"{100 * result['rollout']:.2g} %"
+    return f"{100 * result['derivative']:.2g} % / {rollout}"
 
 
-def _scaling_costs(found: Mapping[str, Any]) -> str:
-    seconds, ratio = found["training_s"], found["evaluation_ratio"]
+def _scaling_costs(result: Mapping[str, Any]) -> str:
+    seconds, ratio = result["training_s"], result["evaluation_ratio"]
     training = f"{seconds:.0f} s" if seconds >= 1 else f"{seconds:.1g} s"
     return f"{training} / " + ("–" if ratio is None else f"{ratio:.2g} ×")

@@ -12,13 +12,13 @@ def rollouts_table(figures: Mapping[str, Any]) -> list[str]:
         "| model | pitch | pitch rate | rotor speed | perturbed: pitch, speed | diverged | fit |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name, found in figures["models"].items():
-        closed, other = found["closed loop"], found["perturbed"]
+    for name, errors in figures["models"].items():
+        closed, other = errors["closed loop"], errors["perturbed"]
         states = ("PtfmPitch", "PtfmPitch_dot", "GenSpeed")
         cells = [f"{_two(closed['filtered'][c])} ({_two(closed['unfiltered'][c])})" for c in states]
         cells.append(", ".join(_two(other["filtered"][c]) for c in (states[0], states[2])))
         cells.append(f"{closed['diverged'] + other['diverged']} of {closed['of'] + other['of']}")
-        cells.append(f"{found['fit_s']:.0f} s")
+        cells.append(f"{errors['fit_s']:.0f} s")
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
 
@@ -31,11 +31,11 @@ def loads_table(figures: Mapping[str, Any]) -> list[str]:
         "|---|---|---|---|---|---|",
     ]
     for run, loads in figures["loads"].items():
-        for load, found in loads.items():
-            power, bins = found["power_ratio"], found["peak_bins"]
+        for load, errors in loads.items():
+            power, bins = errors["power_ratio"], errors["peak_bins"]
             cells = [
-                f"{found['nrmse']:.2f} ({found['nrmse_filtered']:.2f})",
-                f"{found['del_ratio']:.2f}",
+                f"{errors['nrmse']:.2f} ({errors['nrmse_filtered']:.2f})",
+                f"{errors['del_ratio']:.2f}",
                 f"{power['0-0.3 Hz']:.2f}",
                 f"{power['3P']:.2f}",
                 ", ".join("–" if b is None else f"{b:.0f}" for b in bins.values()),
@@ -47,22 +47,22 @@ def loads_table(figures: Mapping[str, Any]) -> list[str]:
 def leak_table(figures: Mapping[str, Any]) -> list[str]:
     """Errors of a linear fit with each of three winds as its disturbance."""
     lines = ["| wind given to the model | pitch | pitch rate | rotor speed |", "|---|---|---|---|"]
-    for wind, found in figures["leak"].items():
-        lines.append(f"| {wind} | {' | '.join(_two(v) for v in found.values())} |")
+    for wind, errors in figures["leak"].items():
+        lines.append(f"| {wind} | {' | '.join(_two(v) for v in errors.values())} |")
     return lines
 
 
 def limits_table(figures: Mapping[str, Any]) -> list[str]:
-    """Errors with fewer runs, other sizes of the network, and the thrust given."""
+    """Errors with fewer runs, other sizes of the network, and the thrust as an input."""
     lines = [
         "| model | training runs | training, validation | pitch | pitch rate | rotor speed "
         "| perturbed: pitch, speed |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name, found in figures["variants"].items():
-        closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
-        pair = ", ".join(f"{found[k] ** 0.5:.3f}" for k in ("training", "validation"))
-        cells = [str(found["runs"]), pair, *(_two(v) for v in closed.values())]
+    for name, result in figures["variants"].items():
+        closed, other = result["closed loop"]["filtered"], result["perturbed"]["filtered"]
+        pair = ", ".join(f"{result[k] ** 0.5:.3f}" for k in ("training", "validation"))
+        cells = [str(result["runs"]), pair, *(_two(v) for v in closed.values())]
         cells.append(_pitch_and_speed(other))
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
@@ -75,9 +75,9 @@ def field_table(figures: Mapping[str, Any]) -> list[str]:
         "| and the rest, shifted in time |",
         "|---|---|---|---|",
     ]
-    for name, found in figures["field"].items():
-        three, whole = (f"{100 * found[k]:.0f} %" for k in ("three signals", "whole field"))
-        middle, most = (f"{100 * v:.0f} %" for v in found["shifted"])
+    for name, shares in figures["field"].items():
+        three, whole = (f"{100 * shares[k]:.0f} %" for k in ("three signals", "whole field"))
+        middle, most = (f"{100 * v:.0f} %" for v in shares["shifted"])
         lines.append(f"| {name} | {three} | {whole} | {middle} (95th percentile: {most}) |")
     return lines
 
@@ -98,11 +98,11 @@ def matched_table(figures: Mapping[str, Any]) -> list[str]:
         f"| difference of the speed: {', '.join(figures['pairs'])} |",
         "|---|---|---|---|---|---|",
     ]
-    for name, found in figures["models"].items():
-        closed, other = found["closed loop"]["filtered"], found["perturbed"]["filtered"]
+    for name, result in figures["models"].items():
+        closed, other = result["closed loop"]["filtered"], result["perturbed"]["filtered"]
         cells = [name, *(_two(v) for v in closed.values())]
         cells.append(_pitch_and_speed(other))
-        cells.append(", ".join(_two(errors[-1]) for errors in found["differences"]))
+        cells.append(", ".join(_two(errors[-1]) for errors in result["differences"]))
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
@@ -114,9 +114,9 @@ def slopes_table(figures: Mapping[str, Any]) -> list[str]:
         "| torque (10⁻⁵ rpm/s per kN m) |",
         "|---|---|---|---|---|",
     ]
-    for name, found in zip(figures["pairs"], figures["slopes"], strict=True):
-        values = [f"{found[c]:.3f}" for c in ("GenSpeed", "PtfmPitch_dot", "BldPitch1")]
-        cells = [*values, f"{1e5 * found['GenTq']:.1f}"]
+    for name, slopes in zip(figures["pairs"], figures["slopes"], strict=True):
+        values = [f"{slopes[c]:.3f}" for c in ("GenSpeed", "PtfmPitch_dot", "BldPitch1")]
+        cells = [*values, f"{1e5 * slopes['GenTq']:.1f}"]
         signed = [c.replace("-", "\N{MINUS SIGN}") for c in cells]
         lines.append(f"| {name} | {' | '.join(signed)} |")
     return lines
@@ -129,9 +129,9 @@ def below_rated_table(figures: Mapping[str, Any]) -> list[str]:
         "| difference of the pair: pitch, speed |",
         "|---|---|---|---|",
     ]
-    for name, found in figures["below rated"].items():
-        cells = [_pitch_and_speed(found[k]["filtered"]) for k in ("closed loop", "perturbed")]
-        difference = found["differences"][0]
+    for name, errors in figures["below rated"].items():
+        cells = [_pitch_and_speed(errors[k]["filtered"]) for k in ("closed loop", "perturbed")]
+        difference = errors["differences"][0]
         cells.append(f"{_two(difference[0])}, {_two(difference[-1])}")
         lines.append(f"| model for {name} | {' | '.join(cells)} |")
     return lines
@@ -139,14 +139,14 @@ def below_rated_table(figures: Mapping[str, Any]) -> list[str]:
 
 def sweep_table(figures: Mapping[str, Any]) -> list[str]:
     """The sweep of constant winds in one line per figure."""
-    found = figures["sweep"]
-    reach = max(found.values(), key=lambda f: f["half_ranges"])["half_ranges"]
-    drift = max(f["drift"] for f in found.values())
-    done = sum(f["completed"] for f in found.values())
+    winds = figures["sweep"]
+    reach = max(winds.values(), key=lambda f: f["half_ranges"])["half_ranges"]
+    drift = max(f["drift"] for f in winds.values())
+    done = sum(f["completed"] for f in winds.values())
     return [
         "| constant winds | simulated to the end | farthest from the middle | drift at last |",
         "|---|---|---|---|",
-        f"| {' to '.join((next(iter(found)), list(found)[-1]))} m/s | {done} of {len(found)} | "
+        f"| {' to '.join((next(iter(winds)), list(winds)[-1]))} m/s | {done} of {len(winds)} | "
         f"{reach:.2f} half-ranges | {drift:.0e} standard deviations per s |",
     ]
 

@@ -155,7 +155,7 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class ControlStudy:
-    """What the study found.
+    """Results of the study.
 
     Attributes
     ----------
@@ -176,10 +176,10 @@ class ControlStudy:
 
     def series(self) -> dict[tuple[str, str], dict[float, Result]]:
         """Results that differ in Θ_p,max only, by wind series and variant."""
-        found: dict[tuple[str, str], dict[float, Result]] = {}
+        groups: dict[tuple[str, str], dict[float, Result]] = {}
         for r in self.results:
-            found.setdefault((r.series, r.variant), {})[r.most_pitch] = r
-        return found
+            groups.setdefault((r.series, r.variant), {})[r.most_pitch] = r
+        return groups
 
 
 def optimize(
@@ -251,8 +251,8 @@ def study(
     size = size or ControlStudySettings()
     begin = clock.perf_counter()
     tasks = [(k, s) for k, region in enumerate(regions) for s in range(len(region.tests))]
-    found = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
-    results = [result for task in tasks for result in found[task]]
+    solved = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
+    results = [result for task in tasks for result in solved[task]]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
@@ -264,7 +264,7 @@ def study(
 def _series(
     shared: tuple[Sequence[Region], ControlStudySettings], task: tuple[int, int]
 ) -> list[Result]:
-    """All problems of one wind series, given by the numbers of its region and of its run there."""
+    """All problems of one wind series, named by the numbers of its region and of its run there."""
     regions, size = shared
     region = regions[task[0]]
     wind, own = region.tests[task[1]], turbine_case(region)
@@ -288,23 +288,23 @@ def _limits(
     training data each is solved from its counterpart in `near`.
     """
     starts = {r.most_pitch: r for r in near}
-    found: dict[float, Result] = {}
+    results: dict[float, Result] = {}
     last = None
     for limit in sorted(size.pitch_limits, reverse=True):
         if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
             last = _tighter(last, limit)
         else:
             last = optimize(region, wind, case, limit, size, starts.get(limit))
-        found[limit] = last
-    return [found[limit] for limit in size.pitch_limits]
+        results[limit] = last
+    return [results[limit] for limit in size.pitch_limits]
 
 
-def _tighter(found: Result, limit: float) -> Result:
+def _tighter(result: Result, limit: float) -> Result:
     """The same result as that of a limit which it keeps."""
-    solution = found.solution
+    solution = result.solution
     low, high = solution.bounds[PITCH]
     bounds = {**solution.bounds, PITCH: np.stack([low, np.minimum(high, limit)])}
-    return replace(found, most_pitch=limit, solution=replace(solution, bounds=bounds))
+    return replace(result, most_pitch=limit, solution=replace(solution, bounds=bounds))
 
 
 def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:
