@@ -1,29 +1,49 @@
-# Two targets for everybody: make demo, make test. Both set up .venv first; Python and make suffice.
+# For everybody: make demo, make test. All targets set up .venv first; Python and make suffice.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Long files first, each file in one process: its models are fitted once.
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test studies lint style types contracts wheel bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/demo.py --output out
 	$(BIN)/python examples/iea15/optimal_control.py --models out --output out
 
+# Everything but the studies.
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow"
 
-lint: $(VENV)/.installed-dev
+# What the documentation states, computed again.
+studies: $(VENV)/.installed-dev
+	$(PYTEST) -m slow
+
+lint: style types contracts
+
+style: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed-dev
 	$(BIN)/basedpyright
+
+contracts: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
+
+# What would be published, looked at and used from an environment of its own.
+wheel: $(VENV)/.installed-dev
+	rm -rf dist
+	$(BIN)/python -m build --wheel
+	$(BIN)/twine check --strict dist/*.whl
+	$(BIN)/python .ci/check_wheel.py dist/*.whl
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out dist
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "dfsm needs Python 3.11 or newer; set PYTHON=")'

@@ -53,15 +53,15 @@ def main() -> None:
     unknown = [n for n in names if n not in PARTS]
     if unknown:
         parser.error(f"no part '{unknown[0]}'; choose from {', '.join(PARTS)}")
-    found: dict[str, object] = {
+    figures: dict[str, object] = {
         "dfsm": dfsm.__version__,
         "python": platform.python_version(),
         "processors": os.cpu_count(),
     }
     warnings.simplefilter("ignore", dfsm.DfsmWarning)
     for name in names:
-        found[name] = PARTS[name]()
-    print(json.dumps(json_value(found), indent=2))
+        figures[name] = PARTS[name]()
+    print(json.dumps(json_value(figures), indent=2))
 
 
 if __name__ == "__main__":

@@ -82,15 +82,15 @@ def solve_with_expressions(
     bounds = {"lbx": (low / scale).ravel(), "ubx": (high / scale).ravel(), "lbg": 0, "ubg": 0}
     middle = np.tile((seen_low + seen_high) / 2, (count, 1))
     first_guess = (np.clip(middle, low, high) / scale).ravel()
-    found, seconds = {}, []
+    solution, seconds = {}, []
     for _ in range(repeats):
         start = clock.perf_counter()
-        found = solver(x0=first_guess, **bounds)
+        solution = solver(x0=first_guess, **bounds)
         seconds.append(clock.perf_counter() - start)
     stats = solver.stats()
     return {
         "ending": stats["return_status"],
-        "objective": float(found["f"]),
+        "objective": float(solution["f"]),
         "iterations": int(stats["iter_count"]),
         "seconds_setup": ready - begin,
         "seconds_solve": min(seconds),

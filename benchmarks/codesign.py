@@ -27,31 +27,31 @@ def run() -> dict[str, Any]:
     }
 
 
-def codesign_figures(found: codesign.Codesign) -> dict[str, Any]:
+def codesign_figures(study: codesign.Codesign) -> dict[str, Any]:
     """What the table and its text need."""
     return {
-        "runs": found.training_runs,
-        "mass": found.surrogate.parameters["m2"],
-        "true_mass": found.truth.parameters["m2"],
-        "cost": found.surrogate.objective,
-        "true_cost": found.truth.objective,
-        "loss": found.loss,
-        "miss": found.miss,
+        "runs": study.training_runs,
+        "mass": study.surrogate.parameters["m2"],
+        "true_mass": study.truth.parameters["m2"],
+        "cost": study.surrogate.objective,
+        "true_cost": study.truth.objective,
+        "loss": study.loss,
+        "miss": study.miss,
     }
 
 
-def adaptive_figures(found: adaptive_robot.AdaptiveStudy) -> dict[str, Any]:
+def adaptive_figures(study: adaptive_robot.AdaptiveStudy) -> dict[str, Any]:
     """What the table and its text need."""
-    result = found.result
+    result = study.result
     best = result.rounds[result.best]
     return {
         "status": result.status.name,
-        "runs": found.training_runs,
+        "runs": study.training_runs,
         "simulations": result.simulations,
         "predicted": result.solution.objective,
         "realised": best.realised.cost,
         "price": best.realised.price,
         "miss": max(map(abs, best.realised.miss.values())),
-        "true_cost": found.truth.objective,
+        "true_cost": study.truth.objective,
         "differences": [r.difference for r in result.rounds],
     }

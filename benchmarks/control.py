@@ -69,7 +69,7 @@ def run() -> dict[str, Any]:
 
 def known() -> dict[str, Any]:
     """Solve the problems with known answers, from straight lines."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name, make in PROBLEMS.items():
         case = make()
         methods: dict[str, Any] = {
@@ -78,28 +78,28 @@ def known() -> dict[str, Any]:
         }
         if name in SHOT:
             methods["multiple_shooting"] = MultipleShooting()
-        found[name] = {"value": case.value} | {
+        results[name] = {"value": case.value} | {
             label: _figures(solve(case.problem, method, case.guess, simulate=False), case.value)
             for label, method in methods.items()
         }
-    return found
+    return results
 
 
-def _figures(found: Solution, value: float) -> dict[str, Any]:
+def _figures(solution: Solution, value: float) -> dict[str, Any]:
     return {
-        "ending": found.ending.name,
-        "objective": found.objective,
-        "relative_error": abs(found.objective - value) / abs(value),
-        "iterations": found.iterations,
-        "intervals": found.grid.intervals,
-        "seconds": found.seconds["solve"],
-        "seconds_compile": found.seconds["compile"],
+        "ending": solution.ending.name,
+        "objective": solution.objective,
+        "relative_error": abs(solution.objective - value) / abs(value),
+        "iterations": solution.iterations,
+        "intervals": solution.grid.intervals,
+        "seconds": solution.seconds["solve"],
+        "seconds_compile": solution.seconds["compile"],
     }
 
 
 def orders(meshes: tuple[int, ...] = MESHES) -> dict[str, Any]:
     """Relative errors of the objective on finer and finer meshes, and the order they show."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in SMOOTH:
         case = PROBLEMS[name]()
         for label, (kind, degree, order) in ORDERS.items():
@@ -112,7 +112,7 @@ def orders(meshes: tuple[int, ...] = MESHES) -> dict[str, Any]:
                 errors.append(abs(solution.objective / case.value - 1))
             # The last meshes may have reached the solver's tolerance.
             shown = np.log2(np.array(errors[:-1]) / np.maximum(errors[1:], 1e-15))
-            found[f"{name}, {label}"] = {
+            results[f"{name}, {label}"] = {
                 "problem": name,
                 "scheme": label,
                 "theory": order,
@@ -121,7 +121,7 @@ def orders(meshes: tuple[int, ...] = MESHES) -> dict[str, Any]:
                 "errors": errors,
                 "orders": [float(v) for v in shown],
             }
-    return found
+    return results
 
 
 def against_expressions(points: int = 1000) -> dict[str, Any]:
@@ -164,18 +164,18 @@ def _fastest(
 
 def turbine_times(points: tuple[int, ...] = POINTS) -> dict[str, Any]:
     """Milliseconds per iteration of IPOPT, compilation left out, with the number of points."""
-    problem, found = turbine(), {}
+    problem, results = turbine(), {}
     for count in points:
         method = DirectTranscription(
             scheme="trapezoidal", mesh=count - 1, refine=None, tolerance=1e-7
         )
         fastest = _fastest(problem, method)
-        found[str(count)] = {
+        results[str(count)] = {
             "ending": fastest.ending.name,
             "iterations": fastest.iterations,
             "ms_per_iteration": 1e3 * fastest.seconds["solve"] / fastest.iterations,
         }
-    return found
+    return results
 
 
 # -- a stand-in for the floating turbine --------------------------------------------------------

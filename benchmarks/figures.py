@@ -64,7 +64,7 @@ def draw_scaling(figures: Mapping[str, Any], path: Path) -> None:
 
 def draw_orders(figures: Mapping[str, Any], path: Path) -> None:
     """Relative error over intervals, a panel per problem; the file's ending is the format."""
-    problems = list(dict.fromkeys(found["problem"] for found in figures.values()))
+    problems = list(dict.fromkeys(curve["problem"] for curve in figures.values()))
     with mpl.rc_context(_STYLE):
         sheet, axes = _sheet(3.4, len(problems), sharey=True)
         for place, problem in zip(axes, problems, strict=True):
@@ -101,7 +101,7 @@ def _save(sheet: Figure, named: Axes, path: Path) -> None:
 
 
 def _logarithmic(place: Axes, across: Sequence[int], what: str) -> None:
-    """Both axes logarithmic, ticks at the values given across and at powers of ten."""
+    """Both axes logarithmic, ticks at the values across and at powers of ten."""
     place.set_xscale("log")
     place.set_yscale("log")
     place.set_xticks(across, [str(i) for i in across])
@@ -116,9 +116,9 @@ def _logarithmic(place: Axes, across: Sequence[int], what: str) -> None:
 def _scaling_panel(
     place: Axes, figures: Mapping[str, Any], key: str, factor: float, title: str, unit: str
 ) -> None:
-    inputs = [found["inputs"] for found in figures.values()]
+    inputs = [size["inputs"] for size in figures.values()]
     for name, look in _KINDS.items():
-        values = [found["results"][name][key] for found in figures.values()]
+        values = [size["results"][name][key] for size in figures.values()]
         # A kind that corrects nothing has no cost of evaluation: its curve ends there.
         heights = [float("nan") if v is None else factor * v for v in values]
         place.plot(inputs, heights, label=name, clip_on=False, **look)
@@ -133,11 +133,11 @@ def _orders_panel(place: Axes, curves: Sequence[Mapping[str, Any]]) -> None:
     intervals, tolerance = curves[0]["intervals"], curves[0]["tolerance"]
     place.axhspan(_LEAST, tolerance, color="#eef1f4", linewidth=0, zorder=0)
     place.text(intervals[0], 3 * _LEAST, "below the solver's tolerance", va="center", color=_GREY)
-    for found in sorted(curves, key=lambda found: list(_SCHEMES).index(found["scheme"])):
-        name, look = _SCHEMES[found["scheme"]]
-        errors = [max(e, _LEAST) for e in found["errors"]]
+    for curve in sorted(curves, key=lambda curve: list(_SCHEMES).index(curve["scheme"])):
+        name, look = _SCHEMES[curve["scheme"]]
+        errors = [max(e, _LEAST) for e in curve["errors"]]
         place.plot(intervals, errors, label=name, clip_on=False, zorder=3, **look)
-        guide = _guide(intervals, errors, found["theory"], tolerance)
+        guide = _guide(intervals, errors, curve["theory"], tolerance)
         place.plot(*guide, color=look["color"], zorder=2, **_DASHED)
     place.plot([], [], color=_GREY, label="slope in theory", **_DASHED)
     _logarithmic(place, intervals, "intervals")

@@ -107,16 +107,18 @@ def main() -> None:
     errors, models = [], []
     for seed in SEEDS:
         model = fit(u[:, start:], y[:, start:], seed)
-        found = [predict(model, *run) for run in zip(u_held, y_held[:, : start + 1], strict=True)]
+        predicted = [
+            predict(model, *run) for run in zip(u_held, y_held[:, : start + 1], strict=True)
+        ]
         models.append(model)
         truth = y_held[:, start:]
-        rms = np.sqrt(np.mean((found - truth) ** 2, axis=1))
+        rms = np.sqrt(np.mean((predicted - truth) ** 2, axis=1))
         errors.append(np.mean(rms / np.std(truth, axis=1)))
         print(f"seed {seed}: {errors[-1]:.3f} on the runs held out", file=sys.stderr)
     best = models[int(np.nanargmin(errors))]
     seconds = time.perf_counter() - begin
-    found = [predict(best, *run) for run in zip(u_test, known, strict=True)]
-    np.savez(sys.argv[2], outputs=np.array(found) * size[1] + middle[1], fit_s=seconds)
+    predicted = [predict(best, *run) for run in zip(u_test, known, strict=True)]
+    np.savez(sys.argv[2], outputs=np.array(predicted) * size[1] + middle[1], fit_s=seconds)
 
 
 if __name__ == "__main__":

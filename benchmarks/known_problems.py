@@ -1,7 +1,7 @@
 """Twelve optimal control problems with known answers, to measure accuracy and convergence.
 
-The optimal values of the first eight are analytic; the others agree on two fine Radau meshes to the
-digits given.
+The optimal values of the first eight are analytic; the others are what two fine Radau meshes
+agree on, to the last digit.
 """
 
 from __future__ import annotations

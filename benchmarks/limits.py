@@ -1,7 +1,7 @@
 """What limits the model of the floating turbine: data, size, or what the three wind signals tell.
 
 The demo's model with fewer training runs, with networks of other sizes, and with a force that no
-user has: the rotor's thrust as recorded, given to it as if it were a disturbance. Everything else
+user has: the rotor's recorded thrust, which it takes as if it were a disturbance. Everything else
 is as in `rollouts`: refinement holds the same share of runs out, seeds 9 and 10 and three perturbed
 runs have no part in any choice.
 
@@ -37,7 +37,7 @@ Runs = Sequence[dfsm.Trajectory]
 
 def run() -> dict[str, Any]:
     """Errors of the variants, the torque coefficient by least squares, and the field's share."""
-    turbine, found = demo(), {}
+    turbine, results = demo(), {}
     winds = turbine.WINDS["all winds"]
     tests = [
         with_thrust(r) for r in (turbine.runs(winds, range(9, 11)), turbine.perturbed(testing=True))
@@ -51,7 +51,7 @@ def run() -> dict[str, Any]:
             # Before the runs held out were learnt from, too.
             checked = [entry for entry in refined.history if "validation" in entry]
             best = min(checked, key=lambda entry: entry["validation"])
-            found[name] = {
+            results[name] = {
                 "runs": len(runs),
                 "training": best["training"],
                 "validation": best["validation"],
@@ -60,7 +60,7 @@ def run() -> dict[str, Any]:
             }
             if name == same:
                 field = field_shares(refined.model, runs)
-        return {"variants": found, "field": field, "braking": braking(turbine)}
+        return {"variants": results, "field": field, "braking": braking(turbine)}
 
 
 def variants(
@@ -75,8 +75,8 @@ def variants(
         yield f"{seeds} seeds per wind speed", few, full, refinement
     for units in UNITS:
         yield _sized(units), every, full, replace(refinement, network=units)
-    given = replace(full, disturbances=(*full.disturbances, THRUST.name))
-    yield "8 seeds, thrust given", with_thrust(every), given, refinement
+    driven = replace(full, disturbances=(*full.disturbances, THRUST.name))
+    yield "8 seeds, thrust given", with_thrust(every), driven, refinement
 
 
 def _sized(units: int) -> str:
@@ -95,7 +95,7 @@ def braking(turbine: Any) -> dict[str, list[float]]:
     runs = turbine.runs(turbine.WINDS["all winds"], range(1, 9))
     free = replace(full.linear, known={})
     known = turbine.BRAKING["GenSpeed"]["GenTq"]
-    found = {"one over the inertia": [known, known]}
+    effects = {"one over the inertia": [known, known]}
     for name, linear in (
         ("LTI", dfsm.LTI()),
         ("LPV", free),
@@ -105,8 +105,8 @@ def braking(turbine: Any) -> dict[str, list[float]]:
         s = model.signals
         row, column = ([c.name for c in g] for g in (s.states, s.inputs))
         values = model.f.coefficients[:, row.index("GenSpeed"), column.index("GenTq")]
-        found[name] = [float(values.max()), float(values.min())]
-    return found
+        effects[name] = [float(values.max()), float(values.min())]
+    return effects
 
 
 def field_shares(model: dfsm.DFSM, runs: Runs) -> dict[str, Any]:
@@ -124,17 +124,17 @@ def field_shares(model: dfsm.DFSM, runs: Runs) -> dict[str, Any]:
     names = model.signals.exogenous
     three = slow(inputs[:, [names.index(n) for n in ("RotWind", "RotShearV", "RotShearH")]])
     rest = slow(field.resample(time).values)
-    rng, found = np.random.default_rng(0), {}
+    rng, shares = np.random.default_rng(0), {}
     shifts = rng.integers(len(rest) // 10, len(rest) * 9 // 10, SHIFTS)
     for row, name in ((1, "pitch acceleration"), (2, "speed's derivative")):
         y = slow(left[:, row])
         shifted = [_explained(y, np.hstack([three, np.roll(rest, s, axis=0)])) for s in shifts]
-        found[name] = {
+        shares[name] = {
             "three signals": _explained(y, three),
             "whole field": _explained(y, np.hstack([three, rest])),
             "shifted": np.quantile(shifted, [0.5, 0.95]).tolist(),
         }
-    return found
+    return shares
 
 
 def _explained(y: Array, X: Array) -> float:

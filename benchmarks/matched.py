@@ -30,7 +30,7 @@ Pair = tuple[dfsm.Trajectory, dfsm.Trajectory]
 
 def run() -> dict[str, Any]:
     """Errors of rollouts and of differences, and what differences of records tell by themselves."""
-    turbine, found, models = demo(), {}, {}
+    turbine, results, models = demo(), {}, {}
     winds = turbine.WINDS["all winds"]
     closed = turbine.runs(winds, range(1, 9))
     training = [*closed, *turbine.perturbed(testing=False)]
@@ -41,7 +41,7 @@ def run() -> dict[str, Any]:
         for correlation in CORRELATIONS:
             refinement = replace(turbine.REFINEMENT, correlation=correlation)
             model = dfsm.fit(training, turbine.refined_settings(), refinement).model
-            found[str(correlation)] = judged(model, tests, pairs)
+            results[str(correlation)] = judged(model, tests, pairs)
             if not correlation:
                 models["all winds"] = model
         models["wind below rated"] = turbine.below_rated().model
@@ -50,7 +50,7 @@ def run() -> dict[str, Any]:
     below = {name: judged(model, tests, [pair]) for name, model in models.items()}
     names = [p.name.removeprefix("iea15_2dof_").removesuffix("_ol") for p in perturbed]
     slopes = [speed_slopes(turbine, pair) for pair in pairs]
-    return {"pairs": names, "models": found, "slopes": slopes, "below rated": below}
+    return {"pairs": names, "models": results, "slopes": slopes, "below rated": below}
 
 
 def judged(
@@ -67,9 +67,9 @@ def judged(
 def difference_errors(model: dfsm.DFSM, pair: Pair) -> list[float]:
     """NRMSE per state of the difference between two rollouts, below the cutoff of `rollouts`."""
     rollouts = [dfsm.simulate(model, r, start=demo().START).trajectory for r in pair]
-    found = _difference([r.select(STATES).values for r in rollouts])
+    predicted = _difference([r.select(STATES).values for r in rollouts])
     truth = _difference([recorded(r) for r in pair])
-    return list(np.sqrt(np.mean((found - truth) ** 2, axis=0)) / truth.std(axis=0))
+    return list(np.sqrt(np.mean((predicted - truth) ** 2, axis=0)) / truth.std(axis=0))
 
 
 def _difference(values: Sequence[Array], cutoff: float = 0.5) -> Array:
@@ -79,7 +79,7 @@ def _difference(values: Sequence[Array], cutoff: float = 0.5) -> Array:
 def speed_slopes(turbine: Any, pair: Pair) -> dict[str, float]:
     """How the speed's derivative depends on states and controls, by least squares on differences.
 
-    No wind enters, and no coefficient is given. In rpm/s per rpm, deg, deg/s and kN m.
+    No wind enters, and no coefficient is known before. In rpm/s per rpm, deg, deg/s and kN m.
     """
     start = turbine.START
     states = _difference([recorded(r) for r in pair], SLOW)

@@ -56,7 +56,7 @@ def figures(models: Mapping[str, dfsm.DFSM]) -> dict[str, Any]:
     }
     return {
         "errors": {
-            name: {where: errors(model, found) for where, found in tests.items()}
+            name: {where: errors(model, group) for where, group in tests.items()}
             for name, model in models.items()
         },
         "poles": {
@@ -98,7 +98,7 @@ def errors(model: dfsm.DFSM, tests: Sequence[dfsm.Trajectory]) -> dict[str, floa
     """
     states = (*ANGLES, *(f"{a}_rate" for a in ANGLES))
     groups = (states, *(model.signals.names(g) for g in ("controls", "disturbances", "parameters")))
-    found = [model.derivative(*(r.select(names).values for names in groups)) for r in tests]
+    slopes = [model.derivative(*(r.select(names).values for names in groups)) for r in tests]
     truth = [SYSTEM.derivative(r) for r in tests]
     rollouts = dfsm.simulate(model, tests)
     done = sum(r.status is dfsm.Status.COMPLETED for r in rollouts)
@@ -113,13 +113,13 @@ def errors(model: dfsm.DFSM, tests: Sequence[dfsm.Trajectory]) -> dict[str, floa
     return {
         "runs": len(tests),
         "completed": done,
-        "derivative": _relative([f[:, 2:] for f in found], [t[:, [1, 3]] for t in truth]),
+        "derivative": _relative([f[:, 2:] for f in slopes], [t[:, [1, 3]] for t in truth]),
         "rollout": rollout,
     }
 
 
-def _relative(found: Sequence[Any], truth: Sequence[Array]) -> float:
-    a, b = np.concatenate(found), np.concatenate(truth)
+def _relative(predicted: Sequence[Any], truth: Sequence[Array]) -> float:
+    a, b = np.concatenate(predicted), np.concatenate(truth)
     return float((np.sqrt(np.mean((a - b) ** 2, axis=0)) / b.std(axis=0)).max())
 
 
@@ -128,10 +128,10 @@ def poles(model: dfsm.DFSM, mass: float) -> dict[str, Any]:
     holding = holding_torques(SYSTEM, HELD, [mass])
     true = SYSTEM.eigenvalues(HELD, holding, (), [mass])
     A = model.jacobians(HELD[[0, 2, 1, 3]], holding, (), [mass])[0]
-    found = np.linalg.eigvals(A)
-    found = found[np.argsort(-found.real)]
+    poles = np.linalg.eigvals(A)
+    poles = poles[np.argsort(-poles.real)]
     return {
         "true": true.real.tolist(),
-        "model": found.real.tolist(),
-        "largest_error": float(np.abs(found - true).max()),
+        "model": poles.real.tolist(),
+        "largest_error": float(np.abs(poles - true).max()),
     }

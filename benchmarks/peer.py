@@ -29,7 +29,7 @@ REQUIREMENT = "jax-sysid==1.1.0"
 INPUTS = ("GenTq", "BldPitch1", "RotWind", "RotShearV", "RotShearH", "Wave1Elev")
 OUTPUTS = ("PtfmPitch", "GenSpeed")
 STEP = 0.5  # s
-WARM_UP = 50.0  # s, recorded before the start of a rollout, from which its state is found
+WARM_UP = 50.0  # s, recorded before the start of a rollout, which tells its state
 # As for dfsm's rollouts: one diverged that is this many times its training half-range away.
 FAR = 10.0
 
@@ -48,8 +48,10 @@ def run() -> dict[str, Any]:
     tests = [run for group in groups.values() for run in group]
     outputs, seconds = fit_and_predict(list(training), list(held), tests)
     seen = np.concatenate([run.window(turbine.START).select(OUTPUTS).values for run in training])
-    found = iter(states(run, values, seen) for run, values in zip(tests, outputs, strict=True))
-    errors = {name: judged(group, [next(found) for _ in group]) for name, group in groups.items()}
+    rollouts = iter(states(run, values, seen) for run, values in zip(tests, outputs, strict=True))
+    errors = {
+        name: judged(group, [next(rollouts) for _ in group]) for name, group in groups.items()
+    }
     return {"models": {NAME: {"fit_s": seconds, **errors}}, "chosen on": [r.name for r in held]}
 
 
@@ -107,7 +109,7 @@ def states(run: dfsm.Trajectory, outputs: Array, seen: Array) -> Array | None:
     if not (np.abs(outputs - (low + high) / 2) <= FAR * (high - low) / 2).all():
         return None
     time = run.window(demo().START).time
-    found = np.full((len(time), len(STATES)), np.nan)
+    values = np.full((len(time), len(STATES)), np.nan)
     steps = time[0] + STEP * np.arange(len(outputs))
-    found[:, [STATES.index(name) for name in OUTPUTS]] = CubicSpline(steps, outputs)(time)
-    return found
+    values[:, [STATES.index(name) for name in OUTPUTS]] = CubicSpline(steps, outputs)(time)
+    return values

@@ -41,12 +41,12 @@ def run() -> dict[str, Any]:
     turbine = demo()
     closed = turbine.runs(turbine.WINDS["all winds"], range(9, 11))
     perturbed = turbine.perturbed(testing=True)
-    found, model = {}, None
+    results, model = {}, None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)
         for name, models, seconds in ladder(turbine):
             model = models[-1]
-            found[name] = {
+            results[name] = {
                 "fit_s": seconds,
                 "closed loop": errors(models, closed),
                 "perturbed": errors(models, perturbed),
@@ -54,7 +54,7 @@ def run() -> dict[str, Any]:
         if model is None:
             raise RuntimeError("no model was fitted")
         return {
-            "models": found,
+            "models": results,
             "leak": leak(turbine),
             "chosen on": model.provenance.record["refinement"]["validation"],
             "loads": loads(model, closed),
@@ -120,7 +120,7 @@ def leak(turbine: Any) -> dict[str, Any]:
     """Errors with three winds as the disturbance: one of them measured on the moving rotor."""
     winds = turbine.WINDS["all winds"]
     training, tests = turbine.runs(winds, range(1, 9)), turbine.runs(winds, range(9, 11))
-    found = {}
+    results = {}
     for wind, hub in (("RtVAvgxh", None), (CORRECTED_WIND, HUB_HEIGHT), ("RotWind", None)):
         full = turbine.refined_settings()
         choices = replace(
@@ -133,29 +133,29 @@ def leak(turbine: Any) -> dict[str, Any]:
             outputs=(),
         )
         model = dfsm.fit(training, choices).model
-        found[wind] = errors([model], tests)["filtered"]
-    return found
+        results[wind] = errors([model], tests)["filtered"]
+    return results
 
 
 def errors(models: Sequence[dfsm.DFSM], runs: Sequence[dfsm.Trajectory]) -> dict[str, Any]:
     """What `judged` says of rollouts; with several models, each run has that of its wind speed."""
-    found = []
+    states = []
     for run in runs:
         model = models[WINDS.index(run.name.split("_")[2]) % len(models)]
         rollout = dfsm.simulate(model, run, start=demo().START)
         completed = rollout.status is dfsm.Status.COMPLETED
-        found.append(rollout.trajectory.select(STATES).values if completed else None)
-    return judged(runs, found)
+        states.append(rollout.trajectory.select(STATES).values if completed else None)
+    return judged(runs, states)
 
 
-def judged(runs: Sequence[dfsm.Trajectory], found: Sequence[Array | None]) -> dict[str, Any]:
+def judged(runs: Sequence[dfsm.Trajectory], states: Sequence[Array | None]) -> dict[str, Any]:
     """NRMSE per state below the cutoff and of all frequencies, mean over completed rollouts.
 
-    `found` has the states (time, state) of every run from the start on, None where its rollout
+    `states` has the states (time, state) of every run from the start on, None where its rollout
     ended early; a column of NaN is a state that was not predicted.
     """
     low, whole = [], []
-    for run, values in zip(runs, found, strict=True):
+    for run, values in zip(runs, states, strict=True):
         if values is None:
             continue
         truth = recorded(run)
@@ -188,8 +188,8 @@ def low_passed(values: Array, step: float, cutoff: float) -> Array:
     return sosfiltfilt(butter(4, cutoff, fs=1 / step, output="sos"), values, axis=0)
 
 
-def _nrmse(found: Array, truth: Array) -> Array:
-    return np.sqrt(np.mean((found - truth) ** 2, axis=0)) / truth.std(axis=0)
+def _nrmse(predicted: Array, truth: Array) -> Array:
+    return np.sqrt(np.mean((predicted - truth) ** 2, axis=0)) / truth.std(axis=0)
 
 
 # -- loads --------------------------------------------------------------------------------------
@@ -197,33 +197,33 @@ def _nrmse(found: Array, truth: Array) -> Array:
 
 def loads(model: dfsm.DFSM, runs: Sequence[dfsm.Trajectory]) -> dict[str, Any]:
     """Tower-base loads along the rollouts, run by run."""
-    found = {}
+    results = {}
     for run in runs:
         rollout = dfsm.simulate(model, run, start=demo().START).trajectory
         recorded = run.window(demo().START)
         speed = recorded["GenSpeed"].mean() / 60
         passing = Band("3P", 2.4 * speed, 3.6 * speed)
-        found[run.name] = {name: _load(recorded, rollout, name, passing) for name in LOADS}
-    return found
+        results[run.name] = {name: _load(recorded, rollout, name, passing) for name in LOADS}
+    return results
 
 
 def _load(
     recorded: dfsm.Trajectory, rollout: dfsm.Trajectory, name: str, passing: Band
 ) -> dict[str, Any]:
-    truth, found = recorded[name], rollout[name]
-    there, here = (spectrum(recorded.time, v) for v in (truth, found))
-    damage = [damage_equivalent_load(v, recorded.duration, 4) for v in (truth, found)]
+    truth, predicted = recorded[name], rollout[name]
+    there, here = (spectrum(recorded.time, v) for v in (truth, predicted))
+    damage = [damage_equivalent_load(v, recorded.duration, 4) for v in (truth, predicted)]
     return {
-        "nrmse": float(_nrmse(found, truth)),
-        "nrmse_filtered": float(_nrmse(*(_low_passed(recorded, v) for v in (found, truth)))),
+        "nrmse": float(_nrmse(predicted, truth)),
+        "nrmse_filtered": float(_nrmse(*(_low_passed(recorded, v) for v in (predicted, truth)))),
         "del_ratio": damage[1] / damage[0],
         "peak_bins": {b.name: _bins_apart(there, here, b) for b in (PLATFORM, WAVE)},
         "power_ratio": {b.name: here.power(b) / there.power(b) for b in (LOW, passing)},
     }
 
 
-def _bins_apart(truth: Spectrum, found: Spectrum, band: Band) -> float:
-    a, b = truth.peak(band), found.peak(band)
+def _bins_apart(truth: Spectrum, predicted: Spectrum, band: Band) -> float:
+    a, b = truth.peak(band), predicted.peak(band)
     width = truth.frequency[1] - truth.frequency[0]
     return float("nan") if a is None or b is None else abs(a - b) / width
 
@@ -241,7 +241,7 @@ def sweep(model: dfsm.DFSM) -> dict[str, Any]:
     columns, observed = s.observed_columns, len(s.observed)
     low, high, std = (np.asarray(a)[columns] for a in (region.low, region.high, region.std))
     grid, operating = np.asarray(region.grid), np.asarray(region.operating)
-    found = {}
+    results = {}
     for wind in SWEEP:
         point = np.array([np.interp(wind, grid, v) for v in operating.T])
         values = dict(zip((c.name for c in s.inputs), point, strict=True))
@@ -250,12 +250,12 @@ def sweep(model: dfsm.DFSM) -> dict[str, Any]:
         states = rollout.trajectory.values[:, :observed]
         last = states[rollout.trajectory.time >= SWEEP_SECONDS - 100]
         slope = np.polyfit(np.linspace(0, 100, len(last)), last, 1)[0] if len(last) else np.nan
-        found[f"{wind:g}"] = {
+        results[f"{wind:g}"] = {
             "completed": rollout.status is dfsm.Status.COMPLETED,
             "half_ranges": float(np.abs((states - (low + high) / 2) / ((high - low) / 2)).max()),
             "drift": float(np.abs(slope / std).max()),
         }
-    return found
+    return results
 
 
 def _constant(model: dfsm.DFSM, values: dict[str, float]) -> dfsm.Trajectory:

@@ -94,7 +94,7 @@ def errors(model: dfsm.DFSM, test: Sequence[dfsm.Trajectory], truth: Array) -> d
     rollouts, against the recorded ones (mean over the runs too; None where one ended early).
     """
     masses = truth.shape[1]
-    found = np.concatenate([model.derivative(*_inputs(model, r)) for r in test])[:, masses:]
+    slopes = np.concatenate([model.derivative(*_inputs(model, r)) for r in test])[:, masses:]
     rollouts = dfsm.simulate(model, test)
     done = sum(r.status is dfsm.Status.COMPLETED for r in rollouts)
     rollout = None
@@ -105,11 +105,11 @@ def errors(model: dfsm.DFSM, test: Sequence[dfsm.Trajectory], truth: Array) -> d
             _relative(r.trajectory.select(names).values, t.select(names).values) for r, t in pairs
         ]
         rollout = float(np.mean(each))
-    return {"derivative": _relative(found, truth), "rollout": rollout, "completed": done}
+    return {"derivative": _relative(slopes, truth), "rollout": rollout, "completed": done}
 
 
-def _relative(found: Array, truth: Array) -> float:
-    return float((np.sqrt(np.mean((found - truth) ** 2, axis=0)) / truth.std(axis=0)).mean())
+def _relative(predicted: Array, truth: Array) -> float:
+    return float((np.sqrt(np.mean((predicted - truth) ** 2, axis=0)) / truth.std(axis=0)).mean())
 
 
 def _inputs(model: dfsm.DFSM, run: dfsm.Trajectory) -> list[Array]:

@@ -17,9 +17,9 @@ PAGE = ROOT / "docs" / "floating-turbine-control.md"
 
 def main() -> None:
     """Turn the example's tables into Markdown."""
-    found = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    tables = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     tables = {}
-    for key, rows in found.items():
+    for key, rows in tables.items():
         columns = tuple(rows[0])
         cells = tuple(tuple(row[c] for c in columns) for row in rows)
         tables[key] = Table(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import control, readme
+from benchmarks import control, control_tables
 from benchmarks.casadi_expressions import solve_with_expressions
 from benchmarks.known_problems import PROBLEMS
 from dfsm.control import DirectTranscription, solve
@@ -59,12 +59,14 @@ def test_multiple_shooting_stands_where_it_was_run():
 def test_known_answers_in_a_table():
     found = {"ending": "SOLVED", "relative_error": 3.21e-8, "iterations": 7, "seconds": 0.0512}
     short = found | {"ending": "COARSE"}
-    lines = readme.known_table({"P": {"value": -0.5, "hermite_simpson": found, "radau": short}})
+    lines = control_tables.known_table(
+        {"P": {"value": -0.5, "hermite_simpson": found, "radau": short}}
+    )
     assert lines[2] == "| P | −0.5 | 3.2·10⁻⁸, 7, 0.051 s | coarse | – |"
 
 
 def test_orders_below_the_tolerance_are_in_brackets():
-    lines = readme.orders_table(figures([1e-3, 1e-7, 1e-9]))
+    lines = control_tables.orders_table(figures([1e-3, 1e-7, 1e-9]))
     assert lines[0] == "| problem, scheme | theory | 5 → 10 | 10 → 20 |"
     assert lines[3] == "| Hager1, Hermite–Simpson | 2 | 2.00 | (−1.50) |"
 
@@ -72,7 +74,7 @@ def test_orders_below_the_tolerance_are_in_brackets():
 def test_the_table_of_speed_shows_how_time_grows():
     found = {"ending": "SOLVED", "iterations": 20, "ms_per_iteration": 5.0}
     slower = found | {"ending": "LIMIT", "ms_per_iteration": 50.0}
-    lines = readme.control_speed_table({"250": found, "1000": slower})
+    lines = control_tables.control_speed_table({"250": found, "1000": slower})
     assert lines[2:] == [
         "| 250 | 20 | 5.00 | 20.0 | – |",
         "| 1000 | limit | 50.0 | 50.0 | 4 × the points, 10 × the time |",
@@ -84,7 +86,7 @@ def test_the_table_of_expressions_leaves_out_what_was_not_run():
     theirs = {"objective": -1.0, "iterations": 10, "seconds_setup": 0.3, "seconds_solve": 5.0}
     parts = dict.fromkeys(("dfsm", "dfsm, compiled", "dfsm, warm start"), ours)
     parts |= {"casadi": theirs, "casadi, compiled": None, "ms_per_iteration": {"dfsm": 50.0}}
-    lines = readme.expressions_table(parts)
+    lines = control_tables.expressions_table(parts)
     assert lines[-1] == "| CasADi expressions | −1.0000 | 10 | 0.30 | 5.0 | 500 | 10 |"
     assert len(lines) == 6
 

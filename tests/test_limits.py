@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 import dfsm
-from benchmarks import limits, matched, readme
+from benchmarks import limits, matched, turbine_tables
 from benchmarks.accuracy import demo
 
 ROOT = Path(__file__).parents[1]
@@ -54,12 +54,12 @@ def test_tables_have_a_line_for_everything():
     errors = {"filtered": {"PtfmPitch": 0.12, "PtfmPitch_dot": 0.2, "GenSpeed": 0.19}}
     found = {"runs": 29, "training": 0.04, "validation": 0.09}
     found |= {"closed loop": errors, "perturbed": errors}
-    (line,) = readme.limits_table({"variants": {"8 seeds": found}})[2:]
+    (line,) = turbine_tables.limits_table({"variants": {"8 seeds": found}})[2:]
     assert line == "| 8 seeds | 29 | 0.200, 0.300 | 0.12 | 0.20 | 0.19 | 0.12, 0.19 |"
     shares = {"three signals": 0.05, "whole field": 0.49, "shifted": [0.13, 0.25]}
-    (line,) = readme.field_table({"field": {"speed": shares}})[2:]
+    (line,) = turbine_tables.field_table({"field": {"speed": shares}})[2:]
     assert line == "| speed | 5 % | 49 % | 13 % (95th percentile: 25 %) |"
-    (line,) = readme.braking_table({"braking": {"LTI": [-5.1e-6, -3.85e-4]}})[2:]
+    (line,) = turbine_tables.braking_table({"braking": {"LTI": [-5.1e-6, -3.85e-4]}})[2:]
     assert line == "| LTI | −0.5 | −38.5 |"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import dfsm
-from benchmarks import parameters, readme
+from benchmarks import fit_tables, parameters
 from conftest import write_config
 from dfsm.config.fit import parse_config
 from dfsm.data.readers import read
@@ -88,7 +88,7 @@ def test_poles_at_the_stationary_point_of_unseen_masses(figures):
 def test_the_table_of_the_documentation(figures):
     text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
     stated = text.split("<!-- parameters -->")[1].split("<!-- end -->")[0].strip().splitlines()
-    found = readme.parameters_table(figures)
+    found = fit_tables.parameters_table(figures)
     assert len(stated) == len(found)
     for row, line in zip(stated, found, strict=True):
         assert row.split("|")[1] == line.split("|")[1]

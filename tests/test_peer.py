@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dfsm
-from benchmarks import peer, readme
+from benchmarks import peer, turbine_tables
 from benchmarks.accuracy import demo
 from benchmarks.rollouts import judged
 from dfsm.core.files import json_value
@@ -73,7 +73,7 @@ def test_the_row_has_a_dash_for_what_was_not_predicted(run, record):
         "closed loop": judged([run], [values]),
         "perturbed": judged([run], [None]),
     }
-    row = readme.rollouts_table(json_value({"models": {peer.NAME: found}}))[-1]
+    row = turbine_tables.rollouts_table(json_value({"models": {peer.NAME: found}}))[-1]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells == [peer.NAME, "0.00 (0.00)", "– (–)", "0.00 (0.00)", "–, –", "1 of 2", "100 s"]
 

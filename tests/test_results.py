@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import accuracy, derivatives, readme
+from benchmarks import accuracy, derivatives, fit_tables
 from dfsm.demos.two_link_robot.article import beyond_section, extraction_section, taylor_section
 from dfsm.demos.two_link_robot.defaults import DEFAULT, KINDS, PEER, fit_kinds
 from dfsm.demos.two_link_robot.extraction import ExtractionSettings, extraction
@@ -45,7 +45,7 @@ def test_accuracy_table() -> None:
     stated = {row[0]: row[1:] for row in rows}
     assert list(stated) == list(accuracy.demo().WINDS)
     # The region's model has all channels of the table, so the columns are the same.
-    wanted_head, _, *wanted = readme.accuracy_table(accuracy.run("6 m/s", "all winds"))
+    wanted_head, _, *wanted = fit_tables.accuracy_table(accuracy.run("6 m/s", "all winds"))
     assert head == [cell.strip() for cell in wanted_head.strip("| ").split(" | ")]
     for line in wanted:
         label, *cells = [cell.strip() for cell in line.strip("| ").split(" | ")]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import readme, scaling
+from benchmarks import fit_tables, scaling
 
 ROOT = Path(__file__).parents[1]
 
@@ -53,7 +53,7 @@ def test_two_masses_have_the_errors_of_the_documentation(documented, smallest, k
 
 def test_the_table_says_where_nothing_was_corrected():
     found = {"derivative": 0.381, "rollout": None, "training_s": 0.034, "evaluation_ratio": None}
-    lines = readme.scaling_table({"16": {"inputs": 48, "results": {"mlp": found}}})
+    lines = fit_tables.scaling_table({"16": {"inputs": 48, "results": {"mlp": found}}})
     assert lines[2] == "| mlp | 38 % / – |"
     assert lines[-1] == "| mlp | 0.03 s / – |"
 

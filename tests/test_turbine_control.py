@@ -21,7 +21,8 @@ from dfsm.report import write_solution_report
 from dfsm.report.publish import publish
 from systems import linear_model
 from turbine_article import CLAIMS, control_article, trends
-from turbine_control import (
+from turbine_control import ControlStudy, ControlStudySettings, optimize, steady_gains, study
+from turbine_problem import (
     BEST_COEFFICIENT,
     BLADE,
     MOMENT,
@@ -29,14 +30,9 @@ from turbine_control import (
     SHEAR,
     SPEED,
     TORQUE,
-    ControlStudy,
-    ControlStudySettings,
     Region,
     mean_power,
-    optimize,
     problem,
-    steady_gains,
-    study,
     turbine_case,
 )
 

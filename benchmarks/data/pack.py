@@ -56,18 +56,18 @@ def field_beside_plane(path: Path, time: Array) -> Trajectory:
     disk = radius <= RADIUS
     plane = np.stack([np.ones(disk.sum()), z[disk], y[disk]], axis=1)
     left = u[:, disk] - (u[:, disk] @ np.linalg.pinv(plane).T) @ plane.T
-    found = {
+    signals = {
         f"ring to {b:g} m": u[:, (radius >= a) & (radius <= b)].mean(axis=1)
         for a, b in pairwise(RINGS)
     }
     twice = (radius[disk] / RADIUS) ** 2
-    found["cos 2"] = (u[:, disk] * np.cos(2 * angle[disk]) * twice).mean(axis=1)
-    found["sin 2"] = (u[:, disk] * np.sin(2 * angle[disk]) * twice).mean(axis=1)
-    found["variance"] = left.var(axis=1)
+    signals["cos 2"] = (u[:, disk] * np.cos(2 * angle[disk]) * twice).mean(axis=1)
+    signals["sin 2"] = (u[:, disk] * np.sin(2 * angle[disk]) * twice).mean(axis=1)
+    signals["variance"] = left.var(axis=1)
     own = field.step * np.arange(field.count) - field.delay
-    values = [np.interp(time, own, v).astype(np.float32) for v in found.values()]
-    units = [*["m/s"] * (len(found) - 1), "m^2/s^2"]
-    channels = tuple(Channel(n, unit) for n, unit in zip(found, units, strict=True))
+    values = [np.interp(time, own, v).astype(np.float32) for v in signals.values()]
+    units = [*["m/s"] * (len(signals) - 1), "m^2/s^2"]
+    channels = tuple(Channel(n, unit) for n, unit in zip(signals, units, strict=True))
     return Trajectory(time, np.stack(values, axis=1), channels, name=path.stem)
 
 

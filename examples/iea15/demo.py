@@ -72,8 +72,8 @@ def folder(output: Path, label: str) -> Path:
 def runs(winds: list[str], seeds: range) -> list[dfsm.Trajectory]:
     """Bundled closed-loop runs, with the wall time that OpenFAST took for each."""
     stems = [f"iea15_2dof_{wind}mps_s{seed:02d}" for wind in winds for seed in seeds]
-    found = dfsm.read_all([next(DATA.glob(f"{stem}.[op]*")) for stem in stems])
-    return with_wall_times(found, DATA / "wall_times.json")
+    runs = dfsm.read_all([next(DATA.glob(f"{stem}.[op]*")) for stem in stems])
+    return with_wall_times(runs, DATA / "wall_times.json")
 
 
 def perturbed(testing: bool) -> list[dfsm.Trajectory]:
@@ -143,7 +143,7 @@ def below_rated() -> dfsm.FitResult:
     training = runs([BELOW_RATED], range(1, 9))
     open_loop = [run for run in perturbed(False) if f"_{BELOW_RATED}mps" in run.name]
     known = {"GenSpeed": motions_below_rated(training)}
-    # The speed settles at 0.039 1/s, as given: a margin beyond that cannot be had.
+    # The speed settles at 0.039 1/s, by those coefficients: a margin beyond that cannot be had.
     linear = dfsm.LPV(schedule="RotWind", points=3, known=known, margin=0.03)
     driving = tuple(n for n in REFINEMENT.latent_inputs or () if n != "BldPitch1")
     refinement = replace(REFINEMENT, latent_inputs=driving)
@@ -173,8 +173,8 @@ def study(
     slow = ("all winds", FOR_CONTROL)  # and so they go first
     tasks = sorted(labels, key=lambda label: label not in slow)
     work = work_through(fit_and_validate, None, tasks, jobs or processors())
-    found = dict(track(work, "models", len(tasks)))
-    return {label: found[label] for label in labels}
+    fits = dict(track(work, "models", len(tasks)))
+    return {label: fits[label] for label in labels}
 
 
 def main() -> None:
@@ -185,10 +185,10 @@ def main() -> None:
     output.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
     with dfsm.show_progress():
-        found = study()
-        for label, (fitted, _) in found.items():
+        results = study()
+        for label, (fitted, _) in results.items():
             dfsm.save(fitted.model, folder(output, label), fitted.nonlinear)
-        validations = {label: validation for label, (_, validation) in found.items()}
+        validations = {label: validation for label, (_, validation) in results.items()}
         report = output / "report.html"
         dfsm.write_report(validations, report, title="IEA 15 MW floating turbine")
     write_json(output / "metrics.json", {k: v.to_dict() for k, v in validations.items()})

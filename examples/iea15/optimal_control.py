@@ -21,7 +21,8 @@ from dfsm.core.workers import processors
 from dfsm.errors import hushed
 from dfsm.report.publish import publish
 from turbine_article import control_article
-from turbine_control import ControlStudy, Region, study
+from turbine_control import ControlStudy, study
+from turbine_problem import Region
 
 # Winds (m/s, as in the file names) and the seeds to optimize for: two in the transition region,
 # one below and one above it.
@@ -30,14 +31,14 @@ SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
 
 def regions(models: Path) -> list[Region]:
     """Models and runs of each region; one model serves all but that below rated wind."""
-    found = []
+    listed = []
     for wind, seeds in SERIES.items():
         name = f"{float(wind):g} m/s"
         best = demo.FOR_CONTROL if wind == demo.BELOW_RATED else "all winds"
         own, model = (dfsm.load(demo.folder(models, label)) for label in (name, best))
         training, tests = demo.runs([wind], range(1, 9)), demo.runs([wind], seeds)
-        found.append(Region(name, float(wind), own, model, training, tests, demo.START))
-    return found
+        listed.append(Region(name, float(wind), own, model, training, tests, demo.START))
+    return listed
 
 
 def main(arguments: Sequence[str] | None = None) -> ControlStudy:
@@ -52,12 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> ControlStudy:
             f"{options.models} holds no model '{missing[0]}': run examples/iea15/demo.py first"
         )
     with dfsm.show_progress(), hushed():  # what they say stands in the tables
-        found = study(regions(options.models), jobs=processors())
-    article = control_article(found)
+        results = study(regions(options.models), jobs=processors())
+    article = control_article(results)
     written = publish(article, options.output)
     print_article(article)
-    print(f"{found.seconds:.0f} s to solve all; page: {written[0].resolve()}")
-    return found
+    print(f"{results.seconds:.0f} s to solve all; page: {written[0].resolve()}")
+    return results
 
 
 if __name__ == "__main__":

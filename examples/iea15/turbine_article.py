@@ -7,7 +7,8 @@ from itertools import pairwise
 
 from dfsm.report.article import Article, Figure, Section, Table, cell_text, listed
 from dfsm.report.control_figures import stacked_figure
-from turbine_control import (
+from turbine_control import ControlStudy, Result
+from turbine_problem import (
     BEST_COEFFICIENT,
     BLADE,
     MOMENT,
@@ -16,8 +17,6 @@ from turbine_control import (
     SPEED,
     TORQUE,
     WIND,
-    ControlStudy,
-    Result,
     mean_power,
     wind_power,
 )
@@ -76,7 +75,7 @@ def control_article(study: ControlStudy) -> Article:
         ),
         sections=(
             trends_section(study),
-            *[_series_section(name, found) for name, found in groups.items()],
+            *[_series_section(name, results) for name, results in groups.items()],
         ),
     )
 
@@ -87,8 +86,8 @@ def control_article(study: ControlStudy) -> Article:
 def trends_section(study: ControlStudy) -> Section:
     """What the paper leads one to expect, checked series by series."""
     rows = [
-        (f"{_short(name)}, {variant}", *trends(found).values())
-        for (name, variant), found in study.series().items()
+        (f"{_short(name)}, {variant}", *trends(by_limit).values())
+        for (name, variant), by_limit in study.series().items()
     ]
     table = Table(
         "control_trends",
@@ -125,15 +124,15 @@ def trends_section(study: ControlStudy) -> Section:
     return Section("trends", "Do the trends hold?", tables=(table, gains))
 
 
-def trends(found: Mapping[float, Result]) -> dict[str, str]:
-    """Say of every claim whether it holds, and what was found.
+def trends(by_limit: Mapping[float, Result]) -> dict[str, str]:
+    """Say of every claim whether it holds, and the figures that say so.
 
     Parameters
     ----------
-    found
+    by_limit
         Results of one wind series and variant by Θ_p,max.
     """
-    solved = [found[limit] for limit in sorted(found) if found[limit].solution.solved]
+    solved = [by_limit[limit] for limit in sorted(by_limit) if by_limit[limit].solution.solved]
     if not solved:
         return dict.fromkeys(CLAIMS, "not solved")
     top = solved[-1]
@@ -169,15 +168,15 @@ def _word(holds: bool) -> str:
 # -- one wind series ----------------------------------------------------------------------------
 
 
-def _series_section(name: str, found: Sequence[Result]) -> Section:
-    first = found[0]
-    own = next(r.case for r in found if r.case.key == "b")
+def _series_section(name: str, results: Sequence[Result]) -> Section:
+    first = results[0]
+    own = next(r.case for r in results if r.case.key == "b")
     loads = listed([f"|{n}| ≤ {own.bounds[n][1]:.0f}" for n in (SHEAR, MOMENT)])
     table = Table(
         f"control_{_short(name)}",
         f"Optimal controls for the wind of {name}",
         _HEADS,
-        tuple(_cells(r) for r in found),
+        tuple(_cells(r) for r in results),
         note=(
             "Power: mean of η τ ω. dβ/dt: RMS. Outside: share of the horizon with an input beyond "
             "its training range, or a combination that did not occur there. Steps: of the solver; "
@@ -195,11 +194,11 @@ def _series_section(name: str, found: Sequence[Result]) -> Section:
     return Section(
         _short(name),
         f"{first.region}: {name}",
-        paragraphs=tuple(_diagnoses(found)),
+        paragraphs=tuple(_diagnoses(results)),
         tables=(table,),
         figures=tuple(
-            _figure(name, [r for r in found if r.variant == variant])
-            for variant in dict.fromkeys(r.variant for r in found)
+            _figure(name, [r for r in results if r.variant == variant])
+            for variant in dict.fromkeys(r.variant for r in results)
             if variant != "a" or first.region == "12 m/s"
         ),
     )
@@ -229,16 +228,16 @@ def _cells(r: Result) -> tuple[str | float | None, ...]:
     )
 
 
-def _diagnoses(found: Sequence[Result]) -> list[str]:
+def _diagnoses(results: Sequence[Result]) -> list[str]:
     """Where a problem has no solution, or leaves the training range."""
     told = []
-    for variant in dict.fromkeys(r.variant for r in found):
-        results = [r for r in found if r.variant == variant]
-        for r in results:
+    for variant in dict.fromkeys(r.variant for r in results):
+        alike = [r for r in results if r.variant == variant]
+        for r in alike:
             if not r.solution.solved:
                 told.append(f"Case {variant}, Θp,max = {r.most_pitch:g} deg: {r.solution.message}.")
         shares: dict[str, list[float]] = {}
-        for r in results:
+        for r in alike:
             for name, share in r.outside.items():
                 shares.setdefault(name, []).append(100 * share)
         left = [
@@ -251,14 +250,14 @@ def _diagnoses(found: Sequence[Result]) -> list[str]:
     return told
 
 
-def _figure(name: str, found: Sequence[Result]) -> Figure:
-    variant = found[0].variant
+def _figure(name: str, results: Sequence[Result]) -> Figure:
+    variant = results[0].variant
     key = f"control_{_short(name)}_{variant.replace(', ', '_')}"
     return stacked_figure(
         key,
         f"Case {variant}, wind of {name}: wind, controls, states, power and tower-base loads for "
         "every Θp,max. Dashed: bounds; those of the platform pitch in the colour of their case.",
-        {f"Θp,max = {r.most_pitch:g} deg": r.solution for r in found},
+        {f"Θp,max = {r.most_pitch:g} deg": r.solution for r in results},
         _FIGURE,
-        {_POWER: {f"Θp,max = {r.most_pitch:g} deg": r.power_course for r in found}},
+        {_POWER: {f"Θp,max = {r.most_pitch:g} deg": r.power_course for r in results}},
     )

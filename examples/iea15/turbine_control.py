@@ -1,95 +1,46 @@
-"""The paper's optimal control study of a floating 15 MW turbine (Sec. 4), on given models and runs.
+"""The paper's optimal control study of a floating 15 MW turbine (Sec. 4), on any models and runs.
 
-    minimise ∫ ( −η τ ω + w₁ τ² + w₂ β² ) dt     τ in MN m, ω in rpm, β in deg
-
-over torque and blade pitch, with the wind known over the horizon, for several limits of the
-platform pitch, and with two sets of bounds: the paper's, on a model of the wind region alone, and
-those of the turbine that was simulated, on one model for all winds.
+Its problem (`turbine_problem`) is solved for several winds and several limits of the platform
+pitch, with the paper's bounds and with those of the turbine that was simulated.
 `examples/iea15/optimal_control.py` runs it on the bundled data.
 """
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 
-from dfsm.control import DirectTranscription, OptimalControlProblem, Solution, solve
+from dfsm.control import DirectTranscription, Solution, solve
 from dfsm.core.progress import track
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.core.workers import work_through
 from dfsm.data.trajectory import Trajectory
-from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
+from turbine_problem import (
+    BLADE,
+    MEGAWATT,
+    PAPER,
+    PITCH,
+    SPEED,
+    TORQUE,
+    WIND,
+    Case,
+    Region,
+    mean,
+    mean_power,
+    problem,
+    turbine_case,
+    wind_power,
+)
 
-# Channels of the turbine, in OpenFAST's words and units: kN m, deg, deg, rpm, m/s, kN, kN m.
-TORQUE, BLADE, PITCH, SPEED, WIND = "GenTq", "BldPitch1", "PtfmPitch", "GenSpeed", "RotWind"
-SHEAR, MOMENT = "TwrBsFxt", "TwrBsMyt"
-# Rotor radius in m, air density in kg/m³ and best power coefficient in steady wind of the IEA 15 MW
-# turbine (Gaertner et al. 2020).
-RADIUS, DENSITY, BEST_COEFFICIENT = 120.0, 1.225, 0.489
-MEGAWATT = np.pi / 30e3  # of kN m × rpm
-_TORQUE_WEIGHT, _BLADE_WEIGHT = 1e-5, 0.5
-_PERCENTILE = 99.9  # of the loads in the training runs, in case (b)
 # Share of the horizon outside the training data above which case (b) is solved inside, too.
 _LEAVES = 0.01
 # What counts as "at the peak" of the platform pitch: this share of the horizon.
 _PEAK = 0.05
-
-Limits = Mapping[str, tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Case:
-    """Bounds and generator efficiency.
-
-    Attributes
-    ----------
-    key, title
-        Short name, and what it is.
-    efficiency
-        η, of mechanical into electrical power.
-    lowest_pitch
-        Lower bound of the platform pitch in deg; the upper one is varied.
-    bounds
-        Of all other channels, in their units.
-    """
-
-    key: str
-    title: str
-    efficiency: float
-    lowest_pitch: float
-    bounds: Limits
-
-    @property
-    def cost(self) -> Callable[..., Any]:
-        """Integrand; the same function for the same efficiency, so that it is compiled once."""
-        return _cost(self.efficiency)
-
-
-@cache
-def _cost(efficiency: float) -> Callable[..., Any]:
-    def cost(s: Any) -> Any:
-        torque = s.u[TORQUE] / 1e3
-        power = efficiency * torque * s.x[SPEED]
-        return -power + _TORQUE_WEIGHT * torque**2 + _BLADE_WEIGHT * s.u[BLADE] ** 2
-
-    return cost
-
-
-CONTROL_BOUNDS: Limits = {TORQUE: (1670.0, 19900.0), BLADE: (0.0, 22.6)}
-PAPER = Case(
-    "a",
-    "the paper's bounds",
-    0.99,
-    0.0,
-    {**CONTROL_BOUNDS, SPEED: (1.9, 7.2), SHEAR: (0.0, 5e3), MOMENT: (0.0, 4e5)},
-)
 
 
 @settings_class
@@ -121,45 +72,6 @@ class ControlStudySettings:
         require(self.points >= 3, "points", self.points, "at least 3")
         require(len(self.pitch_limits) > 0, "pitch_limits", self.pitch_limits, "one or more")
         require(self.duration > 0, "duration", self.duration, "more than 0")
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """A range of wind speeds with its models and its runs.
-
-    Attributes
-    ----------
-    name
-        For tables, e.g. ``"12 m/s"``.
-    wind
-        Mean wind in m/s.
-    own
-        Model fitted to `training`, for case (a).
-    model
-        Model for case (b), which may know more winds.
-    training, tests
-        Runs; the winds of the latter are what controls are optimized for.
-    start
-        Where the horizons begin, in s; the start-up transients before it do not count.
-    """
-
-    name: str
-    wind: float
-    own: DFSM
-    model: DFSM
-    training: Sequence[Trajectory]
-    tests: Sequence[Trajectory]
-    start: float
-
-    @cached_property
-    def best_coefficient(self) -> float:
-        """The best power coefficient that is known of this turbine, of the disk's mean wind.
-
-        In steady wind, or of a training run, which takes more where there is turbulence within the
-        disk.
-        """
-        runs = [run.window(self.start) for run in self.training]
-        return max([BEST_COEFFICIENT, *(mean_power(r) / wind_power(r) for r in runs)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +155,7 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class ControlStudy:
-    """What the study found.
+    """Results of the study.
 
     Attributes
     ----------
@@ -264,83 +176,10 @@ class ControlStudy:
 
     def series(self) -> dict[tuple[str, str], dict[float, Result]]:
         """Results that differ in Θ_p,max only, by wind series and variant."""
-        found: dict[tuple[str, str], dict[float, Result]] = {}
+        groups: dict[tuple[str, str], dict[float, Result]] = {}
         for r in self.results:
-            found.setdefault((r.series, r.variant), {})[r.most_pitch] = r
-        return found
-
-
-def turbine_case(region: Region) -> Case:
-    """Bounds for the turbine that was simulated: rated speed, and loads as in its own runs."""
-    runs = [run.window(region.start) for run in region.training]
-    loads = {
-        name: float(np.percentile(np.abs(np.concatenate([r[name] for r in runs])), _PERCENTILE))
-        for name in (SHEAR, MOMENT)
-    }
-    bounds = {**CONTROL_BOUNDS, SPEED: (1.9, 7.56)} | {n: (-v, v) for n, v in loads.items()}
-    return Case("b", "bounds of this turbine", 0.9576, -1.0, bounds)
-
-
-def mean(run: Trajectory, values: Array) -> float:
-    """Mean over time of values at a run's samples, by the trapezoidal rule."""
-    return float(np.trapezoid(values, run.time) / run.duration)
-
-
-def mean_power(run: Trajectory) -> float:
-    """Mean mechanical power in MW: torque times speed in rad/s."""
-    return mean(run, run[TORQUE] * run[SPEED]) * MEGAWATT
-
-
-def wind_power(run: Trajectory) -> float:
-    """Mean power in MW of the disk's mean wind: of ρ/2 π R² w³."""
-    return DENSITY / 2 * np.pi * RADIUS**2 * mean(run, run[WIND] ** 3) / 1e6
-
-
-def problem(
-    model: DFSM,
-    wind: Trajectory,
-    case: Case,
-    most_pitch: float,
-    horizon: tuple[float, float],
-) -> OptimalControlProblem:
-    """The paper's problem for one wind series.
-
-    Parameters
-    ----------
-    model
-        With the channels of this study.
-    wind
-        Run with the disturbances; what it holds before the horizon gives latent states.
-    case
-        Bounds and efficiency.
-    most_pitch
-        Θ_p,max in deg.
-    horizon
-        First and last time in s.
-
-    Raises
-    ------
-    DfsmError
-        The model lacks one of the study's channels, or the run is too short.
-    """
-    known = {
-        c.name: c for g in ("states", "controls", "outputs") for c in getattr(model.signals, g)
-    }
-    for name in (TORQUE, BLADE, PITCH, SPEED, SHEAR, MOMENT):
-        if name not in known:
-            raise DfsmError(
-                f"the model has no channel '{name}', which the turbine's problem needs: fit one "
-                f"with states {PITCH} and {SPEED}, controls {TORQUE} and {BLADE}, and outputs "
-                f"{SHEAR} and {MOMENT}"
-            )
-    return OptimalControlProblem(
-        model=model,
-        horizon=horizon,
-        cost=case.cost,
-        bounds={**case.bounds, PITCH: (case.lowest_pitch, most_pitch)},
-        disturbances=wind,
-        name=f"{wind.name}, case {case.key}, pitch up to {most_pitch:g} deg",
-    )
+            groups.setdefault((r.series, r.variant), {})[r.most_pitch] = r
+        return groups
 
 
 def optimize(
@@ -412,8 +251,8 @@ def study(
     size = size or ControlStudySettings()
     begin = clock.perf_counter()
     tasks = [(k, s) for k, region in enumerate(regions) for s in range(len(region.tests))]
-    found = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
-    results = [result for task in tasks for result in found[task]]
+    solved = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
+    results = [result for task in tasks for result in solved[task]]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
@@ -425,7 +264,7 @@ def study(
 def _series(
     shared: tuple[Sequence[Region], ControlStudySettings], task: tuple[int, int]
 ) -> list[Result]:
-    """All problems of one wind series, given by the numbers of its region and of its run there."""
+    """All problems of one wind series, named by the numbers of its region and of its run there."""
     regions, size = shared
     region = regions[task[0]]
     wind, own = region.tests[task[1]], turbine_case(region)
@@ -449,23 +288,23 @@ def _limits(
     training data each is solved from its counterpart in `near`.
     """
     starts = {r.most_pitch: r for r in near}
-    found: dict[float, Result] = {}
+    results: dict[float, Result] = {}
     last = None
     for limit in sorted(size.pitch_limits, reverse=True):
         if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
             last = _tighter(last, limit)
         else:
             last = optimize(region, wind, case, limit, size, starts.get(limit))
-        found[limit] = last
-    return [found[limit] for limit in size.pitch_limits]
+        results[limit] = last
+    return [results[limit] for limit in size.pitch_limits]
 
 
-def _tighter(found: Result, limit: float) -> Result:
+def _tighter(result: Result, limit: float) -> Result:
     """The same result as that of a limit which it keeps."""
-    solution = found.solution
+    solution = result.solution
     low, high = solution.bounds[PITCH]
     bounds = {**solution.bounds, PITCH: np.stack([low, np.minimum(high, limit)])}
-    return replace(found, most_pitch=limit, solution=replace(solution, bounds=bounds))
+    return replace(result, most_pitch=limit, solution=replace(solution, bounds=bounds))
 
 
 def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:

@@ -57,7 +57,7 @@ class AdaptiveRobotSettings:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveStudy:
-    """What the study found.
+    """Results of the study.
 
     Attributes
     ----------
@@ -142,8 +142,8 @@ def problem(model: DFSM | ODESystem) -> OptimalControlProblem:
     )
 
 
-def simulated(found: Solution) -> Trajectory:
+def simulated(solution: Solution) -> Trajectory:
     """The true arm under optimal torques, which never leave their bounds between the nodes."""
-    controls = tuple(c for c in found.trajectory.channels if c.role == "control")
-    values = np.clip(found.at(TIME / DURATION)[1], -1.0, 1.0)
+    controls = tuple(c for c in solution.trajectory.channels if c.role == "control")
+    values = np.clip(solution.at(TIME / DURATION)[1], -1.0, 1.0)
     return ROBOT.simulate(TIME, START, Trajectory(TIME, values, controls), name="optimum")

@@ -63,7 +63,7 @@ class CodesignSettings:
 
 @dataclass(frozen=True, eq=False)
 class Codesign:
-    """What the study found.
+    """Results of the study.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Codesign:
         Cost on the arm's equations by mass, the torques optimized for each: the paper's co-design
         done one after the other.
     realised
-        Least cost on the arm's equations with the mass that the surrogate found best.
+        Least cost on the arm's equations with the mass that is best on the surrogate.
     miss
         Largest distance of the arm from where it should end, under the surrogate's optimal torques
         and with its mass: angles in rad, rates in rad/s.
@@ -121,11 +121,11 @@ def study(size: CodesignSettings | None = None, seed: int = 0) -> Codesign:
     """
     size = size or CodesignSettings()
     runs = training_runs(size, seed)
-    found = solve(problem(surrogate(runs, size.corrective)), METHOD)
+    solution = solve(problem(surrogate(runs, size.corrective)), METHOD)
     truth = solve(problem(ARM), METHOD)
-    best = found.parameters["m2"]
+    best = solution.parameters["m2"]
     split = {mass: _cost(mass) for mass in np.linspace(*MASSES, 5).tolist()}
-    return Codesign(found, truth, split, _cost(best), _miss(found), len(runs))
+    return Codesign(solution, truth, split, _cost(best), _miss(solution), len(runs))
 
 
 def _cost(mass: float) -> float:
@@ -135,7 +135,7 @@ def _cost(mass: float) -> float:
 def problem(
     model: DFSM | ODESystem, mass: float | tuple[float, float] = MASSES
 ) -> OptimalControlProblem:
-    """Lift the arm with little torque and a mass that is given or free."""
+    """Lift the arm with little torque and a mass that is fixed or free."""
     # A fit calls the rate of an angle after the angle.
     rate = "dot" if isinstance(model, DFSM) else "rate"
     names = [str(n) for n in ("theta1", f"theta1_{rate}", "theta2", f"theta2_{rate}")]
@@ -181,12 +181,14 @@ def surrogate(runs: Sequence[Trajectory], corrective: CorrectiveSettings) -> DFS
         ).model
 
 
-def _miss(found: Solution) -> dict[str, float]:
+def _miss(solution: Solution) -> dict[str, float]:
     """Where the arm ends under the surrogate's torques and with its mass, from where it should."""
     tau = np.linspace(0, 1, 201)
-    controls = tuple(c for c in found.trajectory.channels if c.role == "control")
-    torque = Trajectory(DURATION * tau, found.at(tau)[1], controls)
-    run = ARM.simulate(torque.time, MIDDLE - MOVE / 2, torque, parameters=[found.parameters["m2"]])
+    controls = tuple(c for c in solution.trajectory.channels if c.role == "control")
+    torque = Trajectory(DURATION * tau, solution.at(tau)[1], controls)
+    run = ARM.simulate(
+        torque.time, MIDDLE - MOVE / 2, torque, parameters=[solution.parameters["m2"]]
+    )
     ends = run.select(c.name for c in ARM.states).values[-1]
     return {
         c.name: float(abs(end - wanted))

@@ -18,15 +18,15 @@ import dfsm
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run both studies and print what they found."""
+    """Run both studies and print their results."""
     parser = argparse.ArgumentParser(description="Co-design and adaptive optimization of robots.")
     parser.add_argument("--seed", type=int, default=0, help="of the simulations and fits")
     seed = parser.parse_args(arguments).seed
     with dfsm.show_progress():
         arm = codesign.study(seed=seed)
     print(f"link mass and torques together, on a surrogate of {arm.training_runs} runs:")
-    for name, found in (("surrogate", arm.surrogate), ("truth", arm.truth)):
-        print(f"  {name}: m2 = {found.parameters['m2']:.4f} kg, cost {found.objective:.5f}")
+    for name, solution in (("surrogate", arm.surrogate), ("truth", arm.truth)):
+        print(f"  {name}: m2 = {solution.parameters['m2']:.4f} kg, cost {solution.objective:.5f}")
     print(f"  with the surrogate's mass the true arm costs {arm.loss:.3%} more than it must")
     for mass, cost in arm.split.items():
         print(f"  m2 = {mass:g} kg, only torques optimized: cost {cost:.5f}")
