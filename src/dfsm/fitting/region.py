@@ -32,15 +32,15 @@ def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     """Ranges, operating points and distances of the training samples of a model."""
     inputs = samples.inputs
     # A signal at a limit differs from file to file by its rounding; that is not "outside".
-    names = [c.name for c in samples.signals.inputs]
+    order = samples.signals.order
+    names = order.names
     steps = np.array([(data.channel(n).step or 0.0) if n in data.names else 0.0 for n in names])
     bins, column = [np.arange(len(inputs))], model.schedule
     if column is not None:
-        order = np.argsort(inputs[:, column], kind="stable")
-        bins = np.array_split(order, _OPERATING_POINTS)
+        ranks = np.argsort(inputs[:, column], kind="stable")
+        bins = np.array_split(ranks, _OPERATING_POINTS)
     operating = np.stack([inputs[rows].mean(axis=0) for rows in bins])
-    given = (*samples.signals.disturbances, *samples.signals.parameters)
-    fixed = np.array([i for i, n in enumerate(names) if n in {c.name for c in given}], dtype=int)
+    fixed = np.r_[order.columns("disturbances"), order.columns("parameters")]
     W, reach = whiten(inputs, samples.runs, bins, column, fixed)
     return Region(
         low=jnp.asarray(inputs.min(axis=0) - steps),
@@ -88,7 +88,7 @@ def whiten(
     total = sums.sum(axis=0)
     means = total[:, 0, 1:] / total[:, :1, 0]
     grid = means[:, schedule or 0]
-    found = []
+    distances = []
     for k in np.unique(groups):
         mine, others = groups == k, total - sums[k]
         # A point that only this run has seen is measured by its own data.
@@ -97,9 +97,9 @@ def whiten(
         W = np.stack([_whitening(s, order) for s in used])
         middles = used[:, 0, 1:] / used[:, :1, 0]
         shares = hats(jnp.asarray(grid), jnp.asarray(z[mine, schedule or 0]))
-        given = map(jnp.asarray, (z[mine], shares, middles, W))
-        found.append(np.sqrt(squared_distance(*given)))
-    reach = float(np.quantile(np.concatenate(found), _SHARE))
+        squared = squared_distance(*map(jnp.asarray, (z[mine], shares, middles, W)))
+        distances.append(np.sqrt(squared))
+    reach = float(np.quantile(np.concatenate(distances), _SHARE))
     return np.stack([_whitening(s, order) for s in total]) / std, reach
 
 

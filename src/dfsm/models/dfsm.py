@@ -9,7 +9,7 @@ one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,6 @@ from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance, SignalTable, blade_harmonics
-from dfsm.numerics.hats import scheduled
 
 if TYPE_CHECKING:
     import control
@@ -97,8 +96,10 @@ class DFSM(eqx.Module):
         Array
             State derivatives per second, shape ``(..., state)``.
         """
-        groups = self._groups(states, controls, disturbances, parameters)
-        return _evaluate(self, _derivative, _joined(groups), scheduled(self.f.schedule, groups))
+        order = self.signals.order
+        groups = order.arrays(states, controls, disturbances, parameters)
+        value = order.element(self.f.schedule, *groups)
+        return _evaluate(self, _derivative, order.join(*groups), value)
 
     def output(
         self,
@@ -123,11 +124,12 @@ class DFSM(eqx.Module):
         Array
             Outputs, shape ``(..., output)``.
         """
-        groups = self._groups(states, controls, disturbances, parameters)
-        inputs = _joined(groups)
+        order = self.signals.order
+        groups = order.arrays(states, controls, disturbances, parameters)
+        inputs = order.join(*groups)
         if self.g is None:
             return jnp.zeros((*inputs.shape[:-1], 0))
-        value = scheduled(self.g.schedule, groups)
+        value = order.element(self.g.schedule, *groups)
         if self.signals.azimuth is None:
             return _evaluate(self, _output, inputs, value)
         if azimuth is None:
@@ -152,40 +154,12 @@ class DFSM(eqx.Module):
         DfsmError
             A group has the wrong number of elements.
         """
-        return _joined(self._groups(states, controls, disturbances, parameters))
-
-    def _groups(
-        self,
-        states: ArrayLike,
-        controls: ArrayLike,
-        disturbances: ArrayLike,
-        parameters: ArrayLike,
-    ) -> list[jax.Array]:
-        """u, w, ξ and p as arrays; those with a wrong number of elements are refused."""
-        groups = []
-        for group, value in (
-            ("controls", controls),
-            ("disturbances", disturbances),
-            ("states", states),
-            ("parameters", parameters),
-        ):
-            array = jnp.asarray(value, dtype=jnp.float64)
-            names = self.signals.names(group)
-            if array.ndim == 0 or array.shape[-1] != len(names):
-                raise DfsmError(
-                    f"{group} have shape {array.shape}, expected the last axis to hold "
-                    f"{len(names)}: {', '.join(names) or 'none'}"
-                )
-            groups.append(array)
-        return groups
+        order = self.signals.order
+        return order.join(*order.arrays(states, controls, disturbances, parameters))
 
     def split(self, inputs: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Take I apart: states, controls, disturbances, parameters."""
-        inputs = jnp.asarray(inputs)
-        s = self.signals
-        ends = np.cumsum([len(s.controls), len(s.disturbances), len(s.states), len(s.parameters)])
-        u, w, x, p = (inputs[..., a:b] for a, b in zip([0, *ends[:-1]], ends, strict=True))
-        return x, u, w, p
+        return self.signals.order.split(jnp.asarray(inputs))
 
     def prepared(self) -> DFSM:
         """The same model with what does not depend on the inputs computed once, for use in loops.
@@ -220,8 +194,7 @@ class DFSM(eqx.Module):
         inputs = self.join(states, controls, disturbances, parameters)
         if inputs.ndim != 1:
             raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
-        xs = self.signals.state_columns
-        us = slice(0, xs.start)
+        xs, us = self.signals.state_columns, self.signals.order.driving_columns
         J = np.asarray(_jacobian(self, _derivative, inputs))
         extra = jnp.zeros(2 if self.signals.azimuth else 0)
         G = (
@@ -310,11 +283,6 @@ def _complex(value: complex) -> str:
     return f"{value.real:.3g}" + (f" ± {value.imag:.3g}i" if value.imag else "")
 
 
-def _joined(groups: Sequence[jax.Array]) -> jax.Array:
-    shape = jnp.broadcast_shapes(*(g.shape[:-1] for g in groups))
-    return jnp.concatenate([jnp.broadcast_to(g, (*shape, g.shape[-1])) for g in groups], axis=-1)
-
-
 def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
     return _sum((model.f, model.e, model.corrected), inputs, value)
 
@@ -358,9 +326,12 @@ def _evaluate(model: DFSM, row: Row, inputs: jax.Array, value: jax.Array) -> jax
         return row(model, *at)
 
     # Blocks keep the activations of hundreds of units in the cache instead of in memory.
-    many, given = flat.shape[0] > 2 * _BLOCK, (flat, values)
-    found = jax.lax.map(one, given, batch_size=_BLOCK) if many else jax.vmap(one)(given)
-    return found.reshape(*inputs.shape[:-1], found.shape[-1])
+    samples = (flat, values)
+    if flat.shape[0] > 2 * _BLOCK:
+        results = jax.lax.map(one, samples, batch_size=_BLOCK)
+    else:
+        results = jax.vmap(one)(samples)
+    return results.reshape(*inputs.shape[:-1], results.shape[-1])
 
 
 @eqx.filter_jit

@@ -53,42 +53,42 @@ class Poles(NamedTuple):
 
 def poles(model: DFSM) -> Poles:
     """Dynamics of a model's latent pairs."""
-    n_uw, even, odd = _rows(model)
+    driving, first, even, odd = _places(model)
     L, b = model.f.coefficients[0], model.f.offsets[0]
     return Poles(
-        -L[even, n_uw + even],
-        L[even, n_uw + odd],
-        L[even, :n_uw] + 1j * L[odd, :n_uw],
+        -L[even, first + even],
+        L[even, first + odd],
+        L[even, driving] + 1j * L[odd, driving],
         b[even] + 1j * b[odd],
     )
 
 
-def with_poles(model: DFSM, found: Poles) -> DFSM:
+def with_poles(model: DFSM, dynamics: Poles) -> DFSM:
     """The model with other dynamics of its latent pairs; JAX can follow it."""
-    n_uw, even, odd = _rows(model)
+    driving, first, even, odd = _places(model)
     L, b = model.f.coefficients, model.f.offsets
     for rows, others, sign, part in ((even, odd, 1.0, jnp.real), (odd, even, -1.0, jnp.imag)):
-        L = L.at[:, rows, n_uw + rows].set(-found.decay)
-        L = L.at[:, rows, n_uw + others].set(sign * found.frequency)
-        L = L.at[:, rows, :n_uw].set(part(found.drive))
-        b = b.at[:, rows].set(part(found.offset))
+        L = L.at[:, rows, first + rows].set(-dynamics.decay)
+        L = L.at[:, rows, first + others].set(sign * dynamics.frequency)
+        L = L.at[:, rows, driving].set(part(dynamics.drive))
+        b = b.at[:, rows].set(part(dynamics.offset))
     return replace(model, f=replace(model.f, coefficients=L, offsets=b))
 
 
-def _rows(model: DFSM) -> tuple[int, IntArray, IntArray]:
-    """Number of inputs that drive the pairs, and the rows of their real and imaginary parts."""
+def _places(model: DFSM) -> tuple[slice, int, IntArray, IntArray]:
+    """Columns that drive the pairs, the states' first, and rows of real and imaginary parts."""
     s = model.signals
-    first, last = len(s.observed), len(s.states)
-    return len(s.driving), np.arange(first, last, 2), np.arange(first + 1, last, 2)
+    rows = np.arange(len(s.observed), len(s.states))
+    return s.order.driving_columns, s.state_columns.start, rows[::2], rows[1::2]
 
 
 @jax.jit
-def evolve(found: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Array:
+def evolve(dynamics: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Array:
     """Follow the latent pairs along inputs that vary linearly within each step.
 
     Parameters
     ----------
-    found
+    dynamics
         The dynamics.
     h
         Steps in s ``(step,)``; a step of zero changes nothing.
@@ -102,15 +102,15 @@ def evolve(found: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Arr
     Array
         Complex, ``(step + 1, pair)``.
     """
-    rate = -found.decay - 1j * found.frequency
+    rate = -dynamics.decay - 1j * dynamics.frequency
     x = h[:, None] * rate
     # exp(x) and the weights of both ends to the order of RK4, which marches the other states.
     growth = 1 + x * (1 + x / 2 * (1 + x / 3 * (1 + x / 4)))
     end = h[:, None] * (1 / 2 + x / 6 + x**2 / 24)
     begin = h[:, None] * (1 + x / 2 + x**2 / 6 + x**3 / 24) - end
-    force = v @ found.drive.T + found.offset
+    force = v @ dynamics.drive.T + dynamics.offset
     added = begin * force[:-1] + end * force[1:]
-    start = -(found.drive @ rest + found.offset) / rate
+    start = -(dynamics.drive @ rest + dynamics.offset) / rate
 
     def step(z: jax.Array, terms: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         z = terms[0] * z + terms[1]
@@ -131,10 +131,10 @@ def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
     s = model.signals
     if not s.latents:
         return inputs
-    found, first = poles(model), s.observed_columns.stop
-    force = inputs[..., : len(s.driving)] @ found.drive.T + found.offset
-    pairs = as_states(force / (found.decay + 1j * found.frequency))
-    return inputs.at[..., first : first + len(s.latents)].set(pairs)
+    dynamics = poles(model)
+    force = inputs[..., s.order.driving_columns] @ dynamics.drive.T + dynamics.offset
+    pairs = as_states(force / (dynamics.decay + 1j * dynamics.frequency))
+    return inputs.at[..., s.latent_columns].set(pairs)
 
 
 def latent_path(model: DFSM, run: Trajectory) -> Array:
@@ -198,14 +198,14 @@ def rest(time: Array, inputs: Array) -> Array:
 # -- adding them to a model ---------------------------------------------------------------------
 
 
-def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Array]) -> DFSM:
+def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[Array]) -> DFSM:
     """A model with latent states in addition.
 
     Parameters
     ----------
     model
         Has none.
-    found
+    dynamics
         Their dynamics.
     coupling
         What one unit of each adds to the derivatives of the other states,
@@ -231,27 +231,26 @@ def add_latents(model: DFSM, found: Poles, coupling: Array, paths: Sequence[Arra
         e=None if model.e is None else model.e.with_more_inputs(at, count),
         g=None if model.g is None else wider(model.g, 0),
         e_g=None if model.e_g is None else model.e_g.with_more_inputs(at, count),
-        region=_with_range(model.region, at, 0, paths),
+        region=_with_range(model.region, slice(at, at), paths),
         corrected=model.corrected,
         corrected_outputs=model.corrected_outputs,
         signals=replace(s, states=(*s.states, *names), latents=names),
         provenance=model.provenance,
     )
-    return with_poles(wide, found)
+    return with_poles(wide, dynamics)
 
 
 def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
     """The model with the training range of its latent states taken from their paths."""
     s = model.signals
-    region = _with_range(model.region, s.observed_columns.stop, len(s.latents), paths)
+    region = _with_range(model.region, s.latent_columns, paths)
     return replace(model, region=replace(region, operating=at_rest(model, region.operating)))
 
 
-def _with_range(region: Region, at: int, old: int, paths: Sequence[Array]) -> Region:
-    """Ranges and moments of the inputs with those of `old` columns from `at` on replaced."""
+def _with_range(region: Region, gone: slice, paths: Sequence[Array]) -> Region:
+    """Ranges and moments of the inputs with those of some columns replaced."""
     z, W = np.concatenate(paths), region.whitening
-    place = np.full(z.shape[1], at)
-    gone = slice(at, at + old)
+    place = np.full(z.shape[1], gone.start)
 
     def put(values: jax.Array, new: Array) -> jax.Array:
         kept = np.delete(np.asarray(values), gone, axis=-1)

@@ -24,7 +24,7 @@ class LinearModel(eqx.Module):
     schedule
         Column of the input vector that schedules, None for an LTI model.
     known
-        Pairs of target and input whose coefficient was given, not fitted.
+        Pairs of target and input whose coefficient is known and was not fitted.
     """
 
     grid: jax.Array
@@ -35,7 +35,7 @@ class LinearModel(eqx.Module):
 
     @property
     def known_inputs(self) -> tuple[int, ...]:
-        """Columns of the inputs with a coefficient that was given."""
+        """Columns of the inputs with a coefficient that is known."""
         return tuple(sorted({column for _, column in self.known}))
 
     def at(self, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
@@ -62,7 +62,7 @@ class LinearModel(eqx.Module):
     def __call__(self, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
         """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``.
 
-        `value` is the schedule's; None takes it from the inputs, see `schedule.scheduled`.
+        `value` is the schedule's; None takes it from the inputs, see `InputOrder.element`.
         """
         L, b = self.at(inputs[self.schedule or 0] if value is None else value)
         return L @ inputs + b

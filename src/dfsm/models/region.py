@@ -95,9 +95,9 @@ class Region(eqx.Module):
         from the inputs.
         """
         inputs = jnp.asarray(inputs)
-        given = self._squared(inputs, slice(self.fixed), value)
+        taken = self._squared(inputs, slice(self.fixed), value)
         added = self._squared(inputs, slice(self.fixed, None), value)
-        return added / jnp.maximum(1 - given, _LEFT)
+        return added / jnp.maximum(1 - taken, _LEFT)
 
     def _squared(self, inputs: jax.Array, rows: slice, value: jax.Array | None = None) -> jax.Array:
         if not self.whitening.size:

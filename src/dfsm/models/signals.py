@@ -18,6 +18,7 @@ from dfsm.data.features import Feature, with_features
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import CORRECTED_WIND, undisturbed_rotor_wind
 from dfsm.errors import DfsmError, near_matches
+from dfsm.models.inputs import GROUPS, InputOrder
 
 
 @settings_class
@@ -60,7 +61,7 @@ class SignalTable:
     specs
         Which states are measured and which are their rates, see `StateSpec`.
     derivatives
-        How derivatives were extracted; initial rates of a rollout are found the same way.
+        How derivatives were extracted; initial rates of a rollout are computed the same way.
     azimuth
         Blade-passing harmonics of the output function, if any.
     hub_height
@@ -85,7 +86,12 @@ class SignalTable:
     @property
     def inputs(self) -> tuple[Channel, ...]:
         """Channels of I = [u, w, ξ, p]."""
-        return (*self.controls, *self.disturbances, *self.states, *self.parameters)
+        return tuple(channel for group in GROUPS for channel in getattr(self, group))
+
+    @property
+    def order(self) -> InputOrder:
+        """Where everything stands in I."""
+        return InputOrder.of(self.names)
 
     @property
     def observed(self) -> tuple[Channel, ...]:
@@ -95,23 +101,28 @@ class SignalTable:
     @property
     def driving(self) -> tuple[str, ...]:
         """Names of controls and disturbances, the columns of B."""
-        return tuple(c.name for c in (*self.controls, *self.disturbances))
+        return self.order.driving
 
     @property
     def state_columns(self) -> slice:
         """Where the states stand in I."""
-        first = len(self.controls) + len(self.disturbances)
-        return slice(first, first + len(self.states))
+        return self.order.columns("states")
 
     @property
     def observed_columns(self) -> slice:
         """Where the states that a recorded run holds stand in I."""
-        return slice(self.state_columns.start, self.state_columns.stop - len(self.latents))
+        return slice(self.state_columns.start, self.latent_columns.start)
+
+    @property
+    def latent_columns(self) -> slice:
+        """Where the latent states stand in I."""
+        last = self.state_columns.stop
+        return slice(last - len(self.latents), last)
 
     @property
     def exogenous(self) -> tuple[str, ...]:
         """Names of what drives a simulation: controls, disturbances, parameters."""
-        return tuple(c.name for c in (*self.controls, *self.disturbances, *self.parameters))
+        return self.order.exogenous
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -61,9 +61,7 @@ class Parametrization(eqx.Module):
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
         varies[list(model.f.known_inputs)] = False
         # Nothing is known yet about states that have only been added.
-        varies[s.observed_columns.stop :] |= np.array(
-            [c in s.latents for c in (*s.latents, *s.parameters)], dtype=bool
-        )
+        varies[s.latent_columns] = True
         scheduled, constant = (tuple(np.flatnonzero(v).tolist()) for v in (varies, ~varies))
         free = tuple(tuple((i, c) not in model.f.known for c in constant) for i in rows)
         typical = np.maximum(spread[list(rows)], np.finfo(float).tiny)
@@ -182,8 +180,7 @@ class Parametrization(eqx.Module):
         """
         s, now, start = self.model.signals, poles(model), poles(self.model)
         z = self._standardised(inputs)
-        first = len(s.driving) + len(s.observed)
-        latent = inputs[first : first + len(s.latents)].reshape(-1, 2)
+        latent = inputs[s.latent_columns].reshape(-1, 2)
         turned = jnp.stack([latent[:, 1], -latent[:, 0]], axis=1)
         moved = jnp.concatenate([z[np.array(self.driven, dtype=int)], jnp.ones(1)])
         drive = jnp.hypot(start.decay, start.frequency)[:, None] * moved
