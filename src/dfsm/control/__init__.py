@@ -1,7 +1,7 @@
 """Open-loop optimal control with a surrogate, or with any model that JAX can follow (Sec. 4).
 
-`problem` says what, `transcription` and `shooting` how; behind them `program` assembles sparse
-nonlinear programs and `nlp` gives them to IPOPT.
+`problem` says what, `nlp/transcription` and `nlp/shooting` how, `solve` does it: `meshes` goes from
+mesh to mesh, and `assembly` makes a solution of where the last one ended.
 """
 
 from dfsm.control.check import RunCheck, check_run

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.control.names import End, Signals
+from dfsm.control.nlp.shot import Method
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Ending, Solution
-from dfsm.control.solve import Method, solve
+from dfsm.control.solve import solve
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import require, settings_class

@@ -19,6 +19,7 @@ from dfsm.control.mesh.grid import Grid
 from dfsm.control.nlp import constraints
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.program import Block, Program, Rows
+from dfsm.control.nlp.shot import Shot, quoted
 from dfsm.control.nlp.terms import Functions, Term, common_of, functions_of
 from dfsm.control.nlp.transcription import node_data
 from dfsm.control.problem import OptimalControlProblem
@@ -27,8 +28,21 @@ from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
 
 
+class _OneMesh:
+    """A mesh that stays as it is: nothing estimates its error."""
+
+    @property
+    def refine(self) -> None:
+        """No error to refine to."""
+
+    @property
+    def most_refinements(self) -> int:
+        """Zero."""
+        return 0
+
+
 @settings_class
-class MultipleShooting:
+class MultipleShooting(_OneMesh):
     """How to shoot.
 
     Attributes
@@ -63,9 +77,13 @@ class MultipleShooting:
         """The mesh of the controls, which are linear on it."""
         return Grid("trapezoidal", 1, np.linspace(0, 1, self.segments * self.pieces + 1))
 
+    def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Shooting:
+        """The problem in segments; the start gives the sizes of variables without bounds."""
+        return Shooting(problem, self, grid, start)
+
 
 @settings_class
-class SingleShooting:
+class SingleShooting(_OneMesh):
     """How to shoot in one segment: few variables, for short horizons and stable models.
 
     Attributes
@@ -97,6 +115,10 @@ class SingleShooting:
         """The mesh of the controls, which are linear on it."""
         return Grid("trapezoidal", 1, np.linspace(0, 1, self.pieces + 1))
 
+    def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Shooting:
+        """The problem in segments; the start gives the sizes of variables without bounds."""
+        return Shooting(problem, self, grid, start)
+
 
 def _check(method: MultipleShooting | SingleShooting) -> None:
     for name in ("segments", "pieces", "steps", "most_iterations"):
@@ -104,13 +126,13 @@ def _check(method: MultipleShooting | SingleShooting) -> None:
     require(method.tolerance > 0, "tolerance", method.tolerance, "more than 0")
 
 
-class Shooting:
+class Shooting(Shot):
     """A problem in segments, as a nonlinear program.
 
     Parameters
     ----------
-    problem, method
-        What, and how.
+    problem, method, grid
+        What, how, and the nodes of the controls.
     start
         Gives the sizes of variables that have no bounds.
     """
@@ -119,9 +141,10 @@ class Shooting:
         self,
         problem: OptimalControlProblem,
         method: MultipleShooting | SingleShooting,
+        grid: Grid,
         start: Start,
     ) -> None:
-        self.problem, self.method, self.grid = problem, method, method.grid()
+        self.problem, self.method, self.grid = problem, method, grid
         self.functions = functions_of(problem)
         nodes = np.arange(len(self.grid.tau))
         ends = nodes[:: method.pieces]
@@ -135,22 +158,13 @@ class Shooting:
         self.term = self.functions.segments[key]
         self.program = self._program()
 
-    @property
-    def tau(self) -> Array:
-        """Normalised times of the nodes."""
-        return self.grid.tau
-
-    def scaled(self, start: Start) -> Array:
-        """The solver's variables at given values, moved within their bounds."""
-        return self.program.scaled(self.layout.pack(start))
-
     def unscaled(self, z: Array) -> Start:
         """Values at the nodes; states inside the segments are the integrator's."""
         start = self.layout.unpack(self.program.physical(z))
         nx, shape = self.functions.nx, (self.layout.scenarios, self.method.segments)
         outputs = self.program.outputs(z)[0].reshape(*shape, -1)
         inner = outputs[..., 1 + nx : 1 + nx * self.method.pieces]
-        at = np.arange(len(self.tau) - 1).reshape(self.method.segments, -1)[:, 1:]
+        at = np.arange(len(self.grid.tau) - 1).reshape(self.method.segments, -1)[:, 1:]
         start.X[:, at] = inner.reshape(*shape, -1, nx)
         return start
 
@@ -165,6 +179,16 @@ class Shooting:
         values = -multipliers[: int(np.prod(shape))].reshape(shape)
         tau = np.linspace(0, 1, self.method.segments + 1)[1:]
         return self.layout.costates(tau, values)
+
+    def row_nodes(self) -> IntArray:
+        """The starts of the segments."""
+        return self.layout.state_nodes[:-1]
+
+    def row_names(self) -> list[str]:
+        """The cost, the states after every piece, and the path constraints around the pieces."""
+        states, pieces = self.functions.plant.names("states"), self.method.pieces
+        simulated = [f"the simulated '{n}'" for n in states * pieces]
+        return ["the cost", *simulated, *quoted(self.functions.path_sizes) * (pieces + 1)]
 
     # -- program --------------------------------------------------------------------------------
 

@@ -20,10 +20,11 @@ from dfsm.control.mesh.schemes import Kind
 from dfsm.control.nlp import constraints
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.program import Block, Program
+from dfsm.control.nlp.shot import Shot, quoted
 from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.settings import require, settings_class
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
 
 
@@ -76,8 +77,12 @@ class DirectTranscription:
         """The first mesh."""
         return grid_of(self.scheme, self.degree, self.mesh)
 
+    def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Transcription:
+        """The problem on a mesh; the start gives the sizes of variables without bounds."""
+        return Transcription(problem, grid, start, self.stay_inside)
 
-class Transcription:
+
+class Transcription(Shot):
     """A problem on one mesh, as a nonlinear program.
 
     Parameters
@@ -138,15 +143,6 @@ class Transcription:
 
     # -- values at the nodes --------------------------------------------------------------------
 
-    @property
-    def tau(self) -> Array:
-        """Normalised times of the nodes."""
-        return self.grid.tau
-
-    def scaled(self, start: Start) -> Array:
-        """The solver's variables at given values, moved within their bounds."""
-        return self.program.scaled(self.layout.pack(start))
-
     def unscaled(self, z: Array) -> Start:
         """Values at the nodes; a control that is not a variable is extrapolated within bounds."""
         start = self.layout.unpack(self.program.physical(z))
@@ -154,7 +150,7 @@ class Transcription:
             return start
         low, high = self.layout.limits()
         u = self.layout.columns[1][:, 0]
-        first = np.stack([self.grid.controls(U, self.tau[:1])[0] for U in start.U])
+        first = np.stack([self.grid.controls(U, self.grid.tau[:1])[0] for U in start.U])
         start.U[:, 0] = np.clip(first, low[u], high[u])
         return start
 
@@ -177,7 +173,7 @@ class Transcription:
         return layout.costates(tau, values)
 
     def slopes(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
-        """State derivatives with normalised time, for states and controls at given times.
+        """State derivatives with normalised time, for states and controls at the same times.
 
         Parameters
         ----------
@@ -194,8 +190,8 @@ class Transcription:
         local = np.concatenate([X, U, np.broadcast_to(shared, rows)], axis=2)
         data = node_data(self.problem, tau, time)
         flat = local.reshape(-1, local.shape[2])
-        found = self.functions.slopes.values(flat, data, self.common)
-        return found.reshape(X.shape) * (start.stop - self.problem.start)
+        slopes = self.functions.slopes.values(flat, data, self.common)
+        return slopes.reshape(X.shape) * (start.stop - self.problem.start)
 
     def errors(self, start: Start) -> Array:
         """Relative local error of every interval, the worst of all states and scenarios."""
@@ -211,12 +207,22 @@ class Transcription:
         size = np.maximum(np.abs(start.X).max(axis=(0, 1)), 1e-3 * self._sizes())
         return (missing / size)[..., self.layout.solved].max(axis=(0, 2))
 
+    def row_nodes(self) -> IntArray:
+        """All of them."""
+        return np.arange(self.layout.nodes)
+
+    def row_names(self) -> list[str]:
+        """The cost, the derivatives of the states, and the path constraints."""
+        states = self.functions.plant.names("states")
+        slopes = [f"the derivative of '{n}'" for n in states]
+        return ["the cost", *slopes, *quoted(self.functions.path_sizes)]
+
     def _sizes(self) -> Array:
         return self.program.scale[self.layout.columns[0][0, 0]]
 
 
 def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Any]:
-    """What every node of every scenario is given: its time and its disturbances."""
+    """Time and disturbances of every node of every scenario."""
     names = problem.plant.names("disturbances")
     count = len(problem.scenarios)
     w = np.zeros((count, len(tau), len(names)))
