@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.linalg import expm
 
 from dfsm.data.trajectory import Channel, Trajectory
@@ -106,6 +106,64 @@ def test_adaptive_methods_meet_their_tolerance():
     assert tight < 1e-6
     assert stiff < 1e-5
     assert tight < loose < 1e-2
+
+
+# ẋ = -x + u: between two samples x follows from the polynomial that u is there, exactly.
+LAG = linear_model(np.array([[-1.0]]), np.array([[1.0]]))
+
+
+def lagged(time: np.ndarray, u: np.ndarray, interpolation: str) -> np.ndarray:
+    """Exact ẋ = -x + u from rest, for the spline through the samples or the line between them."""
+    if interpolation == "cubic":
+        pieces = CubicSpline(time, u)
+    else:
+        pieces = PPoly(np.stack([np.diff(u) / np.diff(time), u[:-1]]), time)
+    # A particular solution is u - u̇ + ü - ...; the rest decays.
+    x = [0.0]
+    for i, (a, b) in enumerate(pairwise(time)):
+        p = np.poly1d(pieces.c[:, i])
+        particular = p - p.deriv() + p.deriv(2) - p.deriv(3)
+        x.append(particular(b - a) + (x[-1] - particular(0)) * np.exp(a - b))
+    return np.array(x)
+
+
+def lag_error(time: np.ndarray, u: np.ndarray, **options) -> float:
+    """Largest error of a rollout of the lag from rest."""
+    run = driving_run(LAG, time, u[:, None], np.zeros((len(time), 1)))
+    result = simulate(LAG, run, settings=SimulationSettings(**options))
+    assert result.status is Status.COMPLETED
+    truth = lagged(time, u, options["interpolation"])
+    return float(np.abs(result.trajectory.values[:, 0] - truth).max())
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_all_methods_agree_on_the_inputs_between_samples(interpolation):
+    time = np.cumsum(np.random.default_rng(3).uniform(0.1, 0.9, 40))
+    u = np.random.default_rng(4).normal(size=40)
+    tight = {"rtol": 1e-10, "atol": 1e-12, "interpolation": interpolation}
+    assert lag_error(time, u, method="rk4", step=0.01, interpolation=interpolation) < 1e-9
+    assert lag_error(time, u, method="tsit5", **tight) < 1e-9
+    # An implicit step is solved for to no more than the tolerance.
+    assert lag_error(time, u, method="kvaerno5", **tight) < 1e-7
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize("method", ["tsit5", "kvaerno5"])
+def test_a_pulse_in_the_middle_of_a_long_rest_is_not_stepped_over(method, interpolation):
+    time = np.arange(0, 2000, 0.1)
+    u = np.where(abs(time - 1234) < 0.5, np.cos(np.pi * (time - 1234)) ** 2, 0.0)
+    assert lagged(time, u, interpolation).max() > 0.3
+    assert lag_error(time, u, method=method, interpolation=interpolation) < 1e-5
+
+
+def test_a_step_ends_only_where_the_inputs_bend():
+    time = np.arange(0, 100, 0.1)
+    corner = np.stack([np.maximum(0, time - 33.3), 7 - 0.3 * time], axis=1)
+    run = Trajectory(time, corner, (Channel("a"), Channel("b")))
+    assert integrate.pieces_of(run, "linear").bends == pytest.approx([33.3])
+    parabola = Trajectory(time, (time**2)[:, None], (Channel("a"),))
+    assert len(integrate.pieces_of(parabola, "linear").bends) == len(time) - 2
+    assert len(integrate.pieces_of(parabola, "cubic").bends) == 0
 
 
 def test_outputs_follow_the_rollout():

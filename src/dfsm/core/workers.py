@@ -1,6 +1,7 @@
 """The same work on many tasks, in processes of their own where more than one may run at a time.
 
-Processes are spawned, not forked: JAX has threads, which a fork would leave in mid-work.
+Processes are spawned, not forked: JAX has threads, which a fork would leave in mid-work. They are
+not joblib's (loky 3.6, in joblib 1.6): its workers do not learn of a killed parent and lived on.
 """
 
 from __future__ import annotations

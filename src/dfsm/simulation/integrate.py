@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +24,8 @@ _PAD = 1000
 _MAX_STEPS = 1_000_000
 # Fixed steps of one run, whose inputs and states are all held in memory.
 _MOST_STEPS = 10_000_000
+# Share of a channel's range by which inputs may leave a polynomial without a bend: rounding.
+_STRAIGHT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -50,12 +53,35 @@ class Mesh:
 
 
 @dataclass(frozen=True)
-class Case:
+class Pieces:
+    """Inputs at every time, as a polynomial between each two samples of a run.
+
+    Attributes
+    ----------
+    time
+        The run's samples in s, ``(sample,)``.
+    coefficients
+        Of the powers three to none of the time since the sample before,
+        ``(4, sample - 1, exogenous)``.
+    bends
+        Samples at which one polynomial does not go on as the other, in s, ``(bend,)``.
+    """
+
+    time: Array
+    coefficients: Array
+    bends: Array
+
+
+Drive = TypeVar("Drive", Mesh, Pieces)
+
+
+@dataclass(frozen=True)
+class Case(Generic[Drive]):
     """Where a rollout starts and what drives it.
 
     Attributes
     ----------
-    mesh
+    drive
         Times and inputs.
     x0
         Initial states ``(state,)``.
@@ -63,7 +89,7 @@ class Case:
         Initial azimuth in rad.
     """
 
-    mesh: Mesh
+    drive: Drive
     x0: Array
     psi0: float
 
@@ -125,6 +151,30 @@ def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
     return Mesh(time, inputs, every)
 
 
+def pieces_of(driven: Trajectory, interpolation: str) -> Pieces:
+    """Interpolate the inputs between samples.
+
+    Parameters
+    ----------
+    driven
+        The exogenous channels of one run.
+    interpolation
+        ``"linear"`` or ``"cubic"`` spline, the same as `mesh_of` evaluates.
+    """
+    time, values = driven.time, driven.values
+    steps = np.diff(time)[:, None]
+    if interpolation == "cubic":
+        coefficients = CubicSpline(time, values).c
+        degree, leading = 3, coefficients[0]
+    else:
+        degree, leading = 1, np.diff(values, axis=0) / steps
+        coefficients = np.stack([0 * leading, 0 * leading, leading, values[:-1]])
+    # How far the one polynomial, carried on over the next interval, misses the other.
+    missed = np.abs(np.diff(leading, axis=0)) * np.maximum(steps[1:], steps[:-1]) ** degree
+    least = _STRAIGHT * np.ptp(values, axis=0) + 8 * np.spacing(np.abs(values).max(axis=0))
+    return Pieces(time, coefficients, time[1:-1][(missed > least).any(axis=1)])
+
+
 def _between(values: Array, parts: Array) -> Array:
     """Values at fractions of every interval between rows, and the last row."""
     steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
@@ -136,7 +186,7 @@ def _between(values: Array, parts: Array) -> Array:
 # -- fixed steps --------------------------------------------------------------------------------
 
 
-def march(model: DFSM, cases: Iterable[Case]) -> Iterator[Rollout]:
+def march(model: DFSM, cases: Iterable[Case[Mesh]]) -> Iterator[Rollout]:
     """Classical RK4, one thread per processor; an accelerator takes all runs in one batch.
 
     On a processor XLA keeps a loop on one core, and a single run stays in its cache where a batch
@@ -162,18 +212,18 @@ def march(model: DFSM, cases: Iterable[Case]) -> Iterator[Rollout]:
             yield from rollouts
 
 
-def _march_batch(model: DFSM, cases: Sequence[Case]) -> list[Rollout]:
-    padded = -(-max(c.mesh.steps for c in cases) // _PAD) * _PAD
+def _march_batch(model: DFSM, cases: Sequence[Case[Mesh]]) -> list[Rollout]:
+    padded = -(-max(c.drive.steps for c in cases) // _PAD) * _PAD
     h = np.zeros((len(cases), padded))
-    inputs = np.zeros((len(cases), 2 * padded + 1, cases[0].mesh.inputs.shape[1]))
-    for i, m in enumerate(c.mesh for c in cases):
+    inputs = np.zeros((len(cases), 2 * padded + 1, cases[0].drive.inputs.shape[1]))
+    for i, m in enumerate(c.drive for c in cases):
         h[i, : m.steps] = np.diff(m.time[::2])
         inputs[i, : len(m.time)] = m.inputs
         inputs[i, len(m.time) :] = m.inputs[-1]
     x0, psi0 = np.stack([c.x0 for c in cases]), np.array([c.psi0 for c in cases])
     states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, inputs))
     rollouts = []
-    for i, m in enumerate(c.mesh for c in cases):
+    for i, m in enumerate(c.drive for c in cases):
         rows = slice(0, m.steps + 1, m.every)
         rollouts.append(Rollout(states[i, rows], outputs[i, rows], outside[i, rows], True))
     return rollouts
@@ -269,57 +319,53 @@ def _observe(
 # -- adaptive steps -----------------------------------------------------------------------------
 
 
-def adapt(model: DFSM, case: Case, method: str, tolerances: tuple[float, float]) -> Rollout:
+def adapt(model: DFSM, case: Case[Pieces], method: str, tolerances: tuple[float, float]) -> Rollout:
     """Integrate one run with diffrax.
+
+    A step ends wherever the inputs bend: across a bend no method has its order, and while the
+    model is at rest the errors by which steps are chosen say nothing about what the inputs do next.
 
     Parameters
     ----------
     model
         The surrogate.
     case
-        The inputs vary linearly between the points of its mesh.
+        Start and inputs.
     method
         ``"tsit5"`` or ``"kvaerno5"`` (stiff).
     tolerances
         Relative, and absolute in standard deviations of each state.
     """
-    mesh = case.mesh
+    drive = case.drive
+    # At least one, and their number is compiled in: bends beyond the end change nothing.
+    bends = np.full((len(drive.bends) // _PAD + 1) * _PAD, np.inf)
+    bends[: len(drive.bends)] = drive.bends
     # Tolerances as arrays: a Python number would be compiled in, and another compile again.
-    rtol, atol = map(jnp.asarray, tolerances)
-    states, outputs, outside, solved = _adapt(
-        model,
-        mesh.time,
-        mesh.inputs,
-        jnp.asarray(case.x0),
-        jnp.asarray(case.psi0),
-        rtol,
-        atol,
-        method=method,
-        every=mesh.every,
-    )
+    arrays = (drive.time, drive.coefficients, bends, case.x0, case.psi0, *tolerances)
+    states, outputs, outside, solved = _adapt(model, *map(jnp.asarray, arrays), method=method)
     return Rollout(np.asarray(states), np.asarray(outputs), np.asarray(outside), bool(solved))
 
 
 @eqx.filter_jit
 def _adapt(
     model: DFSM,
-    time: Array,
-    inputs: Array,
+    samples: jax.Array,
+    coefficients: jax.Array,
+    bends: jax.Array,
     x0: jax.Array,
     psi0: jax.Array,
     rtol: jax.Array,
     atol: jax.Array,
     *,
     method: str,
-    every: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     import diffrax
 
-    path = diffrax.LinearInterpolation(jnp.asarray(time), jnp.asarray(inputs))
+    d, c, b, a = coefficients
+    path = diffrax.CubicInterpolation(samples, (d, c, b, a))
     spread = model.region.std[model.signals.state_columns]
     spread = jnp.where(spread > 0, spread, 1.0)
     term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, path.evaluate(t)) / spread)
-    samples = jnp.asarray(time[:: 2 * every])
     solution = diffrax.diffeqsolve(
         term,
         diffrax.Tsit5() if method == "tsit5" else diffrax.Kvaerno5(),
@@ -329,11 +375,13 @@ def _adapt(
         # Scaled by their spread all states share one absolute tolerance.
         y0=x0 / spread,
         saveat=diffrax.SaveAt(ts=samples),
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
+        stepsize_controller=diffrax.ClipStepSizeController(
+            diffrax.PIDController(rtol=rtol, atol=atol), jump_ts=bends
+        ),
         max_steps=_MAX_STEPS,
         throw=False,
     )
     states = jnp.asarray(solution.ys) * spread
-    v = jnp.asarray(inputs[:: 2 * every])
+    v = jnp.concatenate([a, path.evaluate(samples[-1])[None]])
     outputs, outside = _observe(model, jnp.diff(samples), states, v, psi0)
     return states, outputs, outside, solution.result == diffrax.RESULTS.successful

@@ -24,7 +24,7 @@ from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state
 from dfsm.models.signals import require_constant, with_computed
-from dfsm.simulation.integrate import Case, Rollout, adapt, march, mesh_of
+from dfsm.simulation.integrate import Case, Drive, Rollout, adapt, march, mesh_of, pieces_of
 
 # A rollout ends where a state is this many times its training half-range from the middle.
 _ESCAPE = 10.0
@@ -208,20 +208,20 @@ def simulate(
         require_constant(run, model.signals.names("parameters"))
     given = None if initial is None else _given(model, initial, len(batch))
 
-    def case(i: int) -> Case:
+    def case(i: int, drive: Drive) -> Case[Drive]:
         begins = float(driven[i].time[0])
         x0 = _observed_state(model, batch[i], begins) if given is None else given[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
-        mesh = mesh_of(driven[i], settings.step, settings.interpolation)
-        return Case(mesh, x0, _initial_azimuth(model, batch[i], begins))
+        return Case(drive, x0, _initial_azimuth(model, batch[i], begins))
 
     begin = clock.perf_counter()
-    cases = map(case, range(len(batch)))
+    each, between = range(len(batch)), settings.interpolation
     if settings.method == "rk4":
-        solved = march(model, cases)
+        solved = march(model, (case(i, mesh_of(driven[i], settings.step, between)) for i in each))
     else:
         tolerances = (settings.rtol, settings.atol)
+        cases = (case(i, pieces_of(driven[i], between)) for i in each)
         solved = (adapt(model, c, settings.method, tolerances) for c in cases)
     results = [
         _result(model, r, d, rollout) for r, d, rollout in zip(batch, driven, solved, strict=True)
