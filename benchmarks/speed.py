@@ -18,9 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.linalg import cho_factor, cho_solve
 
 import dfsm
 from benchmarks.accuracy import demo
+from dfsm.core.types import Array
 from dfsm.fitting.linear import fit_linear
 from dfsm.models.corrective import GaussianUnits
 from dfsm.models.dfsm import DFSM
@@ -54,14 +56,16 @@ def best(function: Callable[[], Any], repetitions: int = 5) -> float:
 
 
 def linear_fit() -> dict[str, float]:
-    """One million samples of 6 inputs and 4 derivatives, against numpy.linalg.lstsq."""
+    """One million samples of 6 inputs and 4 derivatives, against two ways of NumPy and SciPy."""
     rng = np.random.default_rng(0)
     inputs = rng.normal(size=(1_000_000, 6)) * [1, 10, 100, 1, 0.1, 1e3] + [5, 0, 3, 1, 1, 1e3]
     targets = inputs @ rng.normal(size=(6, 4)) + rng.normal(size=(1_000_000, 4))
     names = [f"x{i}" for i in range(6)]
     ours = best(lambda: fit_linear([(inputs, targets)], names, dfsm.LTI()))
+    # Theirs need a column of ones, which is not counted.
     affine = np.column_stack([inputs, np.ones(len(inputs))])
     theirs = best(lambda: np.linalg.lstsq(affine, targets, rcond=None), 3)
+    normal = best(lambda: normal_equations(affine, targets))
     L = np.asarray(fit_linear([(inputs, targets)], names, dfsm.LTI()).model.coefficients[0])
     reference = np.linalg.lstsq(affine, targets, rcond=None)[0][:6].T
     scale = inputs.std(axis=0)
@@ -70,8 +74,18 @@ def linear_fit() -> dict[str, float]:
         "dfsm_s": ours,
         "lstsq_s": theirs,
         "times_faster": theirs / ours,
+        "normal_equations_s": normal,
+        "times_faster_than_normal_equations": normal / ours,
         "difference": float(np.abs((L - reference) * scale).max() / largest),
     }
+
+
+def normal_equations(inputs: Array, targets: Array) -> Array:
+    """Coefficients ``(input, target)`` by Cholesky's factors of the normal equations.
+
+    Faster than orthogonal factors, and with half their digits.
+    """
+    return cho_solve(cho_factor(inputs.T @ inputs), inputs.T @ targets)
 
 
 def corrective(runs: list[dfsm.Trajectory]) -> dict[str, float]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import ctypes
+import gc
 import importlib.util
+import resource
 import signal
 import sys
 import warnings
@@ -34,8 +37,11 @@ CONFIG: dict[str, Any] = {
     "corrective": {"kind": "rbf", "samples": 25},
 }
 
-# Files that take minutes; workers take them first, so that none is left alone with one at the end.
-LONG = ("test_results", "test_parameters", "test_studies", "test_adaptive", "test_latents")
+# Files that take longest; workers take them first, so that none is left alone with one at the end.
+LONG = (
+    *("test_results", "test_parameter_study", "test_studies", "test_turbine_control"),
+    *("test_latents", "test_adaptive", "test_refine", "test_control_problems"),
+)
 
 # A job in the background may have been told to ignore Ctrl-C, and would hand that on to commands
 # whose reaction to it is tested.
@@ -44,7 +50,49 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: item.path.stem not in LONG)
+    places = {stem: place for place, stem in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONG)))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Workers tell how much memory they took at most, in kB."""
+    output = getattr(session.config, "workeroutput", None)
+    if output is not None:
+        output["peak"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+class Peaks:
+    """Memory of the workers, for the summary."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: Any) -> None:
+        peak = getattr(node, "workeroutput", {}).get("peak")
+        if peak is not None:
+            self.lines.append(f"{node.gateway.id}: {peak / 1e6:.2f} GB at most")
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        for line in self.lines:
+            terminalreporter.write_line(line)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Peaks())
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_code_ends_with_its_file() -> Iterator[None]:
+    """Drop what JAX compiled for the tests of a file: up to a gigabyte that no other file needs."""
+    yield
+    if "jax" in sys.modules:
+        sys.modules["jax"].clear_caches()
+    gc.collect()
+    # What was freed lies between what is kept, and the C library would not give it back by itself.
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def example_module(name: str) -> ModuleType:

@@ -197,6 +197,7 @@ def test_mass_and_torques_on_a_small_surrogate():
     assert 2.0 <= found.parameters["m2"] <= 3.0
 
 
+@pytest.mark.slow
 def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
     example = example_module("robot/study")
     arm = codesign.CodesignSettings(runs=4, masses=3, corrective=dfsm.GP(samples=40))
@@ -205,8 +206,8 @@ def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
         corrective=dfsm.GP(samples=40),
         settings=dfsm.AdaptiveSettings(most_rounds=1, method=adaptive_robot.METHOD),
     )
-    monkeypatch.setattr(codesign, "CodesignSize", lambda: arm)
-    monkeypatch.setattr(adaptive_robot, "AdaptiveSize", lambda: turn)
+    monkeypatch.setattr(codesign, "CodesignSettings", lambda: arm)
+    monkeypatch.setattr(adaptive_robot, "AdaptiveRobotSettings", lambda: turn)
     example.main(["--seed", "1"])
     out = capsys.readouterr().out
     assert "on a surrogate of 12 runs" in out

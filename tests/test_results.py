@@ -20,6 +20,8 @@ ROOT = Path(__file__).parents[1]
 
 ROBOT = "docs/two-link-robot.md"
 
+pytestmark = pytest.mark.slow
+
 
 def table(name: str, page: str = "README.md") -> list[list[str]]:
     """Cells of a table of the documentation, below its head."""
