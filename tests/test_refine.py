@@ -23,6 +23,7 @@ from dfsm.fitting.linear import LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.corrective import GaussianUnits, Perceptron
 from dfsm.models.model_folder import load
+from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Stop
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings, refine
@@ -172,14 +173,27 @@ def test_runs_with_the_same_disturbances_show_what_controls_do():
 
 
 def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monkeypatch):
-    def nothing(problem, start, penalty):
-        return iter(())
+    class Nothing(LevenbergMarquardt):
+        def __iter__(self):
+            return iter(())
 
-    monkeypatch.setattr(sys.modules[refine.__module__], "levenberg_marquardt", nothing)
+    monkeypatch.setattr(sys.modules[refine.__module__], "LevenbergMarquardt", Nothing)
     with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
         result = refine(biased, runs, CHOICES)
     assert result.model is biased
     assert not result.improved
+
+
+def test_why_a_stage_ended_is_told(runs, biased):
+    enough = refine(biased, runs, replace(CHOICES, iterations=50))
+    # Three stages of a handful of parameters, without noise to overfit, are soon at a minimum.
+    assert set(enough.ended) == {Stop.DECREASE.value}
+    assert len(enough.ended) == len({entry["stage"] for entry in enough.history}) == 3
+    assert enough.model.provenance.record["refinement"]["ended"] == list(enough.ended)
+    few = refine(biased, runs, replace(CHOICES, windows=(5.0,), iterations=1))
+    assert few.ended == ("as many steps as allowed (1)",) * 2
+    late = refine(biased, runs, replace(CHOICES, windows=(5.0,), seconds=0.0))
+    assert late.ended == ("the time was up (refine.seconds)",)
 
 
 def test_the_seed_decides_which_runs_are_held_out(runs, biased):
