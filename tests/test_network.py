@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dfsm.fitting.corrective.network import NetworkError, evaluate, layers
-from dfsm.numerics.levenberg_marquardt import Step, levenberg_marquardt
+from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 
 SIZES = [(3, 4, 2), (3, 4, 5, 2), (2, 3, 3, 3, 1), (1, 1, 6)]
 
@@ -58,7 +58,7 @@ def test_steps_lead_to_the_network_that_made_the_targets():
     problem = NetworkError.of(sizes, z, targets)
     start = w + 0.3 * np.random.default_rng(1).normal(size=w.shape)
     costs = [
-        problem.cost(s.weights) for s in islice(levenberg_marquardt(problem, Step(start), 0), 30)
+        problem.cost(s.weights) for s in islice(LevenbergMarquardt(problem, Step(start), 0), 30)
     ]
     assert (np.diff([problem.cost(start), *costs]) < 0).all()
     assert costs[-1] < 1e-16 * (targets**2).sum()
@@ -70,6 +70,6 @@ def test_a_penalty_makes_the_weights_small():
     problem = NetworkError.of(sizes, z, targets)
     sizes_of = []
     for penalty in (1.0, 1e4):
-        *_, last = islice(levenberg_marquardt(problem, Step(w), penalty), 30)
+        *_, last = islice(LevenbergMarquardt(problem, Step(w), penalty), 30)
         sizes_of.append(np.linalg.norm(last.weights))
     assert sizes_of[1] < 0.1 * sizes_of[0]

@@ -23,10 +23,12 @@ from dfsm.fitting.linear import LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.corrective import GaussianUnits, Perceptron
 from dfsm.models.model_folder import load
+from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Stop
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings, refine
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.slopes import sensitivities, spread_steps
 from dfsm.refinement.start import start_network
 from dfsm.simulation.simulate import simulate
 from systems import OSCILLATOR_A, linear_model, wander
@@ -172,14 +174,27 @@ def test_runs_with_the_same_disturbances_show_what_controls_do():
 
 
 def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monkeypatch):
-    def nothing(problem, start, penalty):
-        return iter(())
+    class Nothing(LevenbergMarquardt):
+        def __iter__(self):
+            return iter(())
 
-    monkeypatch.setattr(sys.modules[refine.__module__], "levenberg_marquardt", nothing)
+    monkeypatch.setattr(sys.modules[refine.__module__], "LevenbergMarquardt", Nothing)
     with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
         result = refine(biased, runs, CHOICES)
     assert result.model is biased
     assert not result.improved
+
+
+def test_why_a_stage_ended_is_told(runs, biased):
+    enough = refine(biased, runs, replace(CHOICES, iterations=50))
+    # Three stages of a handful of parameters, without noise to overfit, are soon at a minimum.
+    assert set(enough.ended) == {Stop.DECREASE.value}
+    assert len(enough.ended) == len({entry["stage"] for entry in enough.history}) == 3
+    assert enough.model.provenance.record["refinement"]["ended"] == list(enough.ended)
+    few = refine(biased, runs, replace(CHOICES, windows=(5.0,), iterations=1))
+    assert few.ended == ("as many steps as allowed (1)",) * 2
+    late = refine(biased, runs, replace(CHOICES, windows=(5.0,), seconds=0.0))
+    assert late.ended == ("the time was up (refine.seconds)",)
 
 
 def test_the_seed_decides_which_runs_are_held_out(runs, biased):
@@ -206,9 +221,9 @@ def test_slopes_agree_with_differences(runs, biased, size):
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("length", "rel"), [(1.0, 1e-5), (10.0, 0.1)])
+@pytest.mark.parametrize(("length", "rel"), [(1.0, 1e-5), (10.0, 0.01)])
 def test_curvature_is_that_of_all_steps(runs, biased, length, rel):
-    """Exactly in short windows; in long ones every fourth step stands for all."""
+    """Exactly in short windows; in long ones one step of four stands for all."""
     records = [record_of(biased, run, 0.1, 0.0, 20.0) for run in runs[:2]]
     parameters = Parametrization.of(biased, np.array([1.0, 3.0]))
     problem = RolloutError(parameters, [records], length, ErrorWeights(np.ones(2)))
@@ -224,6 +239,41 @@ def test_curvature_is_that_of_all_steps(runs, biased, length, rel):
     expected = np.array(J) @ np.array(J).T
     found, _ = problem.normal_equations(at)
     assert np.linalg.norm(found - expected) < rel * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("steps", [39, 40, 41, 42, 43, 400])
+@pytest.mark.parametrize("every", [1, 2, 3, 4, 5])
+def test_steps_that_stand_for_all_stand_in_the_middle(steps, every):
+    kept, counts = spread_steps(steps, every)
+    assert counts.sum() == steps
+    assert (np.diff(kept) > 0).all()
+    assert len(kept) == -(-steps // every)
+    at = np.arange(1, steps + 1.0)
+    # Squares of what grows linearly; the last step of each block would be off by a tenth.
+    assert counts @ at[kept] ** 2 == pytest.approx(np.sum(at**2), rel=0.01)
+
+
+def test_curvature_of_slopes_that_grow_along_a_window():
+    """x' = a x + b u + c near a = 0: the slope by c is the time, which JᵀJ sums up squared."""
+    model = linear_model(np.zeros((1, 1)), np.ones((1, 1)))
+    parameters = Parametrization.of(model, np.ones(1))
+    step, steps = 0.25, 40
+    v = 0.5 + np.zeros((2 * steps + 1, 1))
+    errors = np.random.default_rng(0).normal(size=(steps, 1))
+    at, start = jnp.zeros(parameters.size), jnp.zeros((0, 2, 0))
+    sums, totals = {}, {}
+    for every in (1, 4):
+        S, totals[every] = sensitivities(
+            parameters, at, step, jnp.zeros(1), start, jnp.asarray(v), jnp.asarray(errors), every
+        )
+        J = np.asarray(S)[:, 0] * np.sqrt(spread_steps(steps, every)[1])[:, None]
+        sums[every] = J.T @ J
+    offset = parameters.size - 1
+    time = step * np.arange(1, steps + 1)
+    assert sums[1][offset, offset] == pytest.approx(np.sum(time**2), rel=1e-12)
+    np.testing.assert_allclose(sums[4], sums[1], rtol=0.01, atol=1e-9)
+    np.testing.assert_allclose(totals[4], totals[1], rtol=1e-12)
+    assert float(totals[4][offset]) == pytest.approx(time @ errors[:, 0], rel=1e-12)
 
 
 @pytest.mark.parametrize("network", [0, 3])

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -35,7 +35,7 @@ from dfsm.errors import DfsmError, DfsmWarning, near_matches
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import with_latent_range
 from dfsm.models.signals import Provenance
-from dfsm.numerics.levenberg_marquardt import Step, levenberg_marquardt
+from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
@@ -43,8 +43,7 @@ from dfsm.refinement.start import start_latents, start_network
 
 # Steps without progress on the validation runs after which a stage ends.
 _PATIENCE = 6
-# Damping at the start of a stage, relative to the mean curvature.
-_DAMPING = 1e-3
+_LATE = "the time was up (refine.seconds)"
 
 
 @settings_class
@@ -130,6 +129,8 @@ class RefineResult:
     history
         One entry per step: stage, training and validation error; of the steps on all runs, which
         come last, the training error alone.
+    ended
+        Why each stage ended, and last the steps on all runs, if any.
     message
         The outcome in one sentence.
     """
@@ -139,6 +140,7 @@ class RefineResult:
     before: float
     after: float
     history: tuple[dict[str, float], ...]
+    ended: tuple[str, ...]
     message: str
 
 
@@ -222,11 +224,13 @@ def refine(
     best, samples = at, sum(r.states[1:].size for r in train_runs)
     kept = StabilityKept(parameters, samples)
     history: list[dict[str, float]] = []
+    ended: list[str] = []
     for stage, length in enumerate(settings.windows):
         problem = RolloutError(parameters, train, length, weights, kept)
         check = RolloutError(parameters, held, length, weights)
-        at, found = _stage(problem, check, at, settings.iterations, late)
-        history += [{"stage": stage, **entry} for entry in found]
+        at, entries, why = _stage(problem, check, at, settings.iterations, late)
+        history += [{"stage": stage, **entry} for entry in entries]
+        ended.append(why)
         error = final.relative(at)
         if error < after:
             best, after = at, error
@@ -234,13 +238,14 @@ def refine(
         length, stage = settings.windows[-1], len(settings.windows)
         count = sum(entry["stage"] == stage - 1 for entry in history)
         problem = RolloutError(parameters, [*train, *held], length, weights, kept)
-        best, found = _on_all(problem, best, count, late)
-        history += [{"stage": stage, **entry} for entry in found]
+        best, entries, why = _on_all(problem, best, count, late)
+        history += [{"stage": stage, **entry} for entry in entries]
+        ended.append(why)
     refined = parameters.at(jnp.asarray(best))
     if refined.signals.latents:
         refined = with_latent_range(refined, [r.latent_states(refined) for r in train_runs])
     names = {"training": [r.name for r in training], "validation": [r.name for r in validation]}
-    return _result(model, refined, (before, after), history, names)
+    return _result(model, refined, (before, after), (history, ended), names)
 
 
 def _drivers(model: DFSM, settings: RefineSettings) -> tuple[str, ...] | None:
@@ -275,50 +280,56 @@ def _stage(
     start: Array,
     limit: int,
     late: Callable[[], bool],
-) -> tuple[Array, list[dict[str, float]]]:
-    """Step until the validation windows no longer improve; the best weights and the history."""
+) -> tuple[Array, list[dict[str, float]], str]:
+    """Step until the validation windows no longer improve.
+
+    Returns
+    -------
+    tuple
+        The best weights, one entry of the history per step, and why there are no more.
+    """
     best, error, taken = start, check.relative(start), 0
     history: list[dict[str, float]] = []
-    for count, step in enumerate(_steps(problem, start, limit), start=1):
+    steps = LevenbergMarquardt(problem, Step(start), 0.0)
+    for count, step in enumerate(track(islice(steps, limit), "refining", limit), start=1):
         now = check.relative(step.weights)
         history.append({"training": problem.relative(step.weights), "validation": now})
         if now < error:
             best, error, taken = step.weights, now, count
-        if count - taken >= _PATIENCE or late():
-            break
-    return best, history
+        if count - taken >= _PATIENCE:
+            return best, history, f"no better on the runs held out for {_PATIENCE} steps"
+        if late():
+            return best, history, _LATE
+    return best, history, _reason(steps, limit)
 
 
 def _on_all(
-    problem: RolloutError, start: Array, count: int, late: Callable[[], bool]
-) -> tuple[Array, list[dict[str, float]]]:
-    """Step so many times; the last weights and the history."""
-    at, history = start, []
-    for step in _steps(problem, start, count):
+    problem: RolloutError, start: Array, limit: int, late: Callable[[], bool]
+) -> tuple[Array, list[dict[str, float]], str]:
+    """Step at most so many times; as `_stage`, with the last weights."""
+    at = start
+    history: list[dict[str, float]] = []
+    steps = LevenbergMarquardt(problem, Step(start), 0.0)
+    for step in track(islice(steps, limit), "refining", limit):
         at = step.weights
         history.append({"training": problem.relative(at)})
         if late():
-            break
-    return at, history
+            return at, history, _LATE
+    return at, history, _reason(steps, limit)
 
 
-def _steps(problem: RolloutError, start: Array, limit: int) -> Iterator[Step]:
-    """At most so many steps, none from where a rollout is not finite."""
-    if not np.isfinite(problem.cost(start)):
-        return
-    curvature = np.trace(problem.normal_equations(start)[0]) / len(start)
-    steps = levenberg_marquardt(problem, Step(start, _DAMPING * curvature), 0.0)
-    yield from track(islice(steps, limit), "refining", limit)
+def _reason(steps: LevenbergMarquardt, limit: int) -> str:
+    return steps.stop.value if steps.stop else f"as many steps as allowed ({limit})"
 
 
 def _result(
     model: DFSM,
     refined: DFSM,
     errors: tuple[float, float],
-    history: Sequence[dict[str, float]],
+    account: tuple[Sequence[dict[str, float]], Sequence[str]],
     names: Mapping[str, list[str]],
 ) -> RefineResult:
-    before, after = errors
+    (before, after), (history, ended) = errors, account
     improved = after < before
     figures = f"{np.sqrt(before):.3g} to {np.sqrt(after):.3g}"
     if improved:
@@ -328,7 +339,13 @@ def _result(
             "steps on all runs followed"
         )
         record = dict(model.provenance.record)
-        record["refinement"] = {**names, "before": before, "after": after, "message": message}
+        record["refinement"] = {
+            **names,
+            "before": before,
+            "after": after,
+            "ended": list(ended),
+            "message": message,
+        }
         model = replace(refined, provenance=Provenance(record))
     else:
         message = (
@@ -336,4 +353,4 @@ def _result(
             "it started from is returned: use more runs, or shorter refine.windows"
         )
         warnings.warn(message, DfsmWarning, stacklevel=3)
-    return RefineResult(model, improved, before, after, tuple(history), message)
+    return RefineResult(model, improved, before, after, tuple(history), tuple(ended), message)

@@ -33,11 +33,11 @@ from dfsm.models.signals import with_computed
 from dfsm.numerics.filters import moving_average
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.slopes import FAR, sensitivities
+from dfsm.refinement.slopes import FAR, sensitivities, spread_steps
 from dfsm.simulation.integrate import exogenous_groups, rk4
 
-# JᵀJ is summed over every fourth step, and over more where windows have few: slopes hardly change
-# from one to the next, and products of their matrices would be most of the time. Jᵀr is exact.
+# JᵀJ is summed over the middle one of every four steps, and over more where windows have few:
+# products of the matrices of slopes would be most of the time. Jᵀr is exact.
 _EVERY, _FEWEST = 4, 10
 
 
@@ -325,7 +325,8 @@ def _slopes(
     follow = partial(sensitivities, parameters, w, windows.step, every=every)
     each = (starts, slopes, jnp.asarray(windows.inputs), jnp.asarray(errors * scale))
     S, totals = jax.lax.map(lambda one: follow(*one), each)
-    J = S * (scale * np.sqrt(steps / (steps // every)))[:, None]
+    _, counts = spread_steps(steps, every)
+    J = S * (np.sqrt(counts)[:, None] * scale)[..., None]
     return J.reshape(-1, w.size), totals.sum(axis=0)
 
 

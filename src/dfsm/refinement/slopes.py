@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from dfsm.core.types import Array, IntArray
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import poles
 from dfsm.refinement.parameters import Parametrization
@@ -28,6 +30,31 @@ _BLOCK = 48
 _At = tuple[jax.Array, jax.Array]
 
 
+def spread_steps(steps: int, every: int) -> tuple[IntArray, Array]:
+    """Steps that stand for all in a sum over a window, and how many each stands for.
+
+    Slopes grow along a window, so that each stands in the middle of its block, where a linear
+    function has its mean; an even block has two middles, which are taken in turns. The last block
+    may be shorter.
+
+    Parameters
+    ----------
+    steps
+        Number of steps.
+    every
+        Steps per block.
+
+    Returns
+    -------
+    tuple of ndarray
+        Places, counted from 0, and counts, shape ``(block,)`` with ``steps`` over `every` blocks,
+        rounded up.
+    """
+    first = np.arange(0, steps, every)
+    count = np.minimum(every, steps - first)
+    return first + (count - 1 + np.arange(len(first)) % 2) // 2, count.astype(float)
+
+
 def sensitivities(
     parameters: Parametrization,
     w: jax.Array,
@@ -38,7 +65,7 @@ def sensitivities(
     errors: jax.Array,
     every: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Slopes of the observed states along a rollout, as `rk4` would find them.
+    """Slopes of the observed states along a rollout, those of what `rk4` does.
 
     Once the path is known, what each step does to the slopes, S ← Φ S + G, follows for all steps
     at once; only that recursion is left to march. A latent pair depends on its own parameters
@@ -59,12 +86,12 @@ def sensitivities(
     errors
         Factors e of the slopes in a sum, ``(step, observed state)``.
     every
-        After how many steps slopes are kept; the sum is over all.
+        Steps of which one keeps its slopes, see `spread_steps`; the sum is over all.
 
     Returns
     -------
     tuple of Array
-        S after every so many steps, ``(step // every, observed state, parameter)``, and Σ Sᵀ e,
+        S after the steps kept, ``(block, observed state, parameter)``, and Σ Sᵀ e,
         ``(parameter,)``.
     """
     model = parameters.at(w)
@@ -72,12 +99,12 @@ def sensitivities(
     observed, steps = len(model.signals.observed), len(path.states)
 
     def along(
-        at: tuple[jax.Array, jax.Array], block: tuple[_Path, jax.Array]
+        at: tuple[jax.Array, jax.Array], block: tuple[_Path, jax.Array, jax.Array]
     ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         S, total = at
-        part, e = block
+        part, e, keep = block
         S, each = jax.lax.scan(_advance, S, _transitions(parameters, w, model, step, part))
-        return (S, total + jnp.einsum("tap,ta->p", each, e)), each[every - 1 :: every]
+        return (S, total + jnp.einsum("tap,ta->p", each, e)), each[keep]
 
     # Blocks stay in the cache; beyond the end the last step is repeated, and does not count.
     size = -(-min(_BLOCK, steps) // every) * every
@@ -87,10 +114,14 @@ def sensitivities(
         end = [(0, count * size - steps)] + [(0, 0)] * (a.ndim - 1)
         return jnp.pad(a, end, mode=mode).reshape(count, size, *a.shape[1:])
 
+    kept, _ = spread_steps(steps, every)
+    keep = np.zeros(count * size // every, dtype=int)
+    keep[: len(kept)] = kept % size
     along_path = jax.tree.map(partial(blocks, mode="edge"), path)
     start = jnp.zeros((observed, w.size)), jnp.zeros(w.size)
-    (_, total), S = jax.lax.scan(along, start, (along_path, blocks(errors, "constant")))
-    return S.reshape(-1, observed, w.size)[: steps // every], total
+    each = along_path, blocks(errors, "constant"), jnp.asarray(keep).reshape(count, -1)
+    (_, total), S = jax.lax.scan(along, start, each)
+    return S.reshape(-1, observed, w.size)[: len(kept)], total
 
 
 def _advance(S: jax.Array, transition: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

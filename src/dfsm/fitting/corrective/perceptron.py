@@ -15,7 +15,7 @@ from dfsm.core.types import Array, IntArray
 from dfsm.fitting.corrective.network import NetworkError, Sizes, evaluate, layers
 from dfsm.fitting.corrective.training import SEARCH_SAMPLES, CorrectiveFit, TrainingSet
 from dfsm.models.corrective import Perceptron
-from dfsm.numerics.levenberg_marquardt import Step, levenberg_marquardt
+from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 
 # Steps without progress on the held-out runs after which training stops.
 _PATIENCE = 20
@@ -133,5 +133,5 @@ def _steps(
 ) -> Iterator[tuple[int, Step]]:
     """At most `limit` training steps, counted from 1, with a progress bar."""
     problem = NetworkError.of(sizes, data.z, data.targets)
-    steps = levenberg_marquardt(problem, start, settings.weight_decay * len(data.z))
+    steps = LevenbergMarquardt(problem, start, settings.weight_decay * len(data.z))
     yield from enumerate(track(islice(steps, limit), "training", limit), start=1)
