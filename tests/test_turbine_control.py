@@ -214,7 +214,7 @@ def test_the_page_holds_every_series_and_the_figures_every_limit(
         names = {c.name for c in figure.panels[3].curves}
         assert names == {"Θp,max = 5 deg", "Θp,max = 7 deg", "bounds"}
     # One figure is enough to print.
-    own = ControlStudy(found.results[2:4], found.size, found.seconds, found.gains)
+    own = ControlStudy(found.results[2:4], found.settings, found.seconds, found.gains)
     written = publish(control_article(own), tmp_path)
     tables = json.loads(written[1].read_text(encoding="utf-8"))
     assert len(tables["control_12mps_s09"]) == 2

@@ -161,7 +161,7 @@ class ControlStudy:
     ----------
     results
         In the order solved.
-    size
+    settings
         How much was computed.
     seconds
         Wall time.
@@ -170,7 +170,7 @@ class ControlStudy:
     """
 
     results: tuple[Result, ...]
-    size: ControlStudySettings
+    settings: ControlStudySettings
     seconds: float
     gains: Mapping[str, tuple[float, float]]
 
@@ -187,7 +187,7 @@ def optimize(
     wind: Trajectory,
     case: Case,
     most_pitch: float,
-    size: ControlStudySettings,
+    settings: ControlStudySettings,
     near: Result | None = None,
 ) -> Result:
     """Solve the problem for one wind series and one limit of the platform pitch.
@@ -200,7 +200,7 @@ def optimize(
         One of the region's test runs.
     case, most_pitch
         Bounds.
-    size
+    settings
         Nodes, horizon and tolerance.
     near
         Stay inside the training data, and start from this result.
@@ -209,13 +209,13 @@ def optimize(
     guess = near.solution if near is not None and near.solution.solved else None
     method = DirectTranscription(
         scheme="trapezoidal",
-        mesh=size.points - 1,
+        mesh=settings.points - 1,
         refine=None,
-        tolerance=size.tolerance,
+        tolerance=settings.tolerance,
         stay_inside=inside,
     )
     model = region.own if case is PAPER else region.model
-    horizon = (region.start, region.start + size.duration)
+    horizon = (region.start, region.start + settings.duration)
     solution = solve(problem(model, wind, case, most_pitch, horizon), method, guess)
     run, names = solution.trajectory, [c.name for c in model.signals.inputs]
     beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
@@ -235,7 +235,7 @@ def optimize(
 
 
 def study(
-    regions: Sequence[Region], size: ControlStudySettings | None = None, jobs: int = 1
+    regions: Sequence[Region], settings: ControlStudySettings | None = None, jobs: int = 1
 ) -> ControlStudy:
     """Solve both cases for every wind series and every limit of the platform pitch.
 
@@ -243,35 +243,37 @@ def study(
     ----------
     regions
         Models and runs.
-    size
-        How much to compute; None is the paper's size.
+    settings
+        How much to compute; None is what the paper does.
     jobs
         Wind series at a time, each in a process of its own.
     """
-    size = size or ControlStudySettings()
+    settings = settings or ControlStudySettings()
     begin = clock.perf_counter()
     tasks = [(k, s) for k, region in enumerate(regions) for s in range(len(region.tests))]
-    solved = dict(track(work_through(_series, (regions, size), tasks, jobs), "series", len(tasks)))
+    solved = dict(
+        track(work_through(_series, (regions, settings), tasks, jobs), "series", len(tasks))
+    )
     results = [result for task in tasks for result in solved[task]]
     gains = {}
     for region in regions:
         models = {"a": region.own, "b": region.model}
         for key, model in models.items():
             gains[f"{region.name}, case {key}"] = steady_gains(model, region.wind)
-    return ControlStudy(tuple(results), size, clock.perf_counter() - begin, gains)
+    return ControlStudy(tuple(results), settings, clock.perf_counter() - begin, gains)
 
 
 def _series(
     shared: tuple[Sequence[Region], ControlStudySettings], task: tuple[int, int]
 ) -> list[Result]:
     """All problems of one wind series, named by the numbers of its region and of its run there."""
-    regions, size = shared
+    regions, settings = shared
     region = regions[task[0]]
     wind, own = region.tests[task[1]], turbine_case(region)
-    paper, free = (_limits(region, wind, case, size) for case in (PAPER, own))
+    paper, free = (_limits(region, wind, case, settings) for case in (PAPER, own))
     results = [*paper, *free]
-    if size.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
-        results += _limits(region, wind, own, size, free)
+    if settings.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
+        results += _limits(region, wind, own, settings, free)
     return results
 
 
@@ -279,10 +281,10 @@ def _limits(
     region: Region,
     wind: Trajectory,
     case: Case,
-    size: ControlStudySettings,
+    settings: ControlStudySettings,
     near: Sequence[Result] = (),
 ) -> list[Result]:
-    """Results for all limits of the platform pitch, as they stand in `size`.
+    """Results for all limits of the platform pitch, as they stand in `settings`.
 
     Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too. Inside the
     training data each is solved from its counterpart in `near`.
@@ -290,13 +292,13 @@ def _limits(
     starts = {r.most_pitch: r for r in near}
     results: dict[float, Result] = {}
     last = None
-    for limit in sorted(size.pitch_limits, reverse=True):
+    for limit in sorted(settings.pitch_limits, reverse=True):
         if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
             last = _tighter(last, limit)
         else:
-            last = optimize(region, wind, case, limit, size, starts.get(limit))
+            last = optimize(region, wind, case, limit, settings, starts.get(limit))
         results[limit] = last
-    return [results[limit] for limit in size.pitch_limits]
+    return [results[limit] for limit in settings.pitch_limits]
 
 
 def _tighter(result: Result, limit: float) -> Result:

@@ -46,13 +46,13 @@ class AdaptiveRobotSettings:
         Training runs to begin with.
     corrective
         Kind of corrective function.
-    options
+    loop
         When to stop.
     """
 
     runs: int = 10
     corrective: CorrectiveSettings = GP(samples=300)
-    options: AdaptiveSettings = AdaptiveSettings(most_rounds=15, method=METHOD)
+    loop: AdaptiveSettings = AdaptiveSettings(most_rounds=15, method=METHOD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,12 @@ class AdaptiveStudy:
         return abs(self.result.solution.objective - true) / true
 
 
-def study(size: AdaptiveRobotSettings | None = None, seed: int = 0) -> AdaptiveStudy:
+def study(settings: AdaptiveRobotSettings | None = None, seed: int = 0) -> AdaptiveStudy:
     """Run the loop from a few random runs, and solve on the arm's equations.
 
     Parameters
     ----------
-    size
+    settings
         How much to compute; None makes the full study.
     seed
         Seed of everything random.
@@ -94,13 +94,13 @@ def study(size: AdaptiveRobotSettings | None = None, seed: int = 0) -> AdaptiveS
     -------
     AdaptiveStudy
     """
-    size = size or AdaptiveRobotSettings()
-    runs = training_runs(size.runs, seed)
+    settings = settings or AdaptiveRobotSettings()
+    runs = training_runs(settings.runs, seed)
 
     def fitted(known: Sequence[Trajectory]) -> DFSM:
-        return surrogate(known, size.corrective)
+        return surrogate(known, settings.corrective)
 
-    result = optimize_adaptively(runs, fitted, problem, simulated, size.options)
+    result = optimize_adaptively(runs, fitted, problem, simulated, settings.loop)
     return AdaptiveStudy(result, solve(problem(ROBOT), METHOD), len(runs))
 
 

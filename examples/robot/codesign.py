@@ -105,12 +105,12 @@ class Codesign:
         return (self.realised - self.truth.objective) / self.truth.objective
 
 
-def study(size: CodesignSettings | None = None, seed: int = 0) -> Codesign:
+def study(settings: CodesignSettings | None = None, seed: int = 0) -> Codesign:
     """Optimize mass and torques on a surrogate and on the arm's equations.
 
     Parameters
     ----------
-    size
+    settings
         How much to compute; None makes the full study.
     seed
         Seed of everything random.
@@ -119,9 +119,9 @@ def study(size: CodesignSettings | None = None, seed: int = 0) -> Codesign:
     -------
     Codesign
     """
-    size = size or CodesignSettings()
-    runs = training_runs(size, seed)
-    solution = solve(problem(surrogate(runs, size.corrective)), METHOD)
+    settings = settings or CodesignSettings()
+    runs = training_runs(settings, seed)
+    solution = solve(problem(surrogate(runs, settings.corrective)), METHOD)
     truth = solve(problem(ARM), METHOD)
     best = solution.parameters["m2"]
     split = {mass: _cost(mass) for mass in np.linspace(*MASSES, 5).tolist()}
@@ -152,15 +152,15 @@ def problem(
     )
 
 
-def training_runs(size: CodesignSettings, seed: int) -> list[Trajectory]:
+def training_runs(settings: CodesignSettings, seed: int) -> list[Trajectory]:
     """Half a second each, with every mass in turn, from random states under random torques."""
     hold = holding_torques(ARM, MIDDLE, [sum(MASSES) / 2])
     return ARM.campaign(
-        size.runs * size.masses,
+        settings.runs * settings.masses,
         np.linspace(0, DURATION, 51),
         Uniform(low=tuple(MIDDLE - AROUND), high=tuple(MIDDLE + AROUND)),
         RandomKnots(low=tuple(hold - PUSH), high=tuple(hold + PUSH), spacing=0.05),
-        parameters=np.linspace(*MASSES, size.masses)[:, None],
+        parameters=np.linspace(*MASSES, settings.masses)[:, None],
         seed=seed,
     )
 
