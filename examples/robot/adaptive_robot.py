@@ -46,13 +46,13 @@ class AdaptiveRobotSettings:
         Training runs to begin with.
     corrective
         Kind of corrective function.
-    options
+    settings
         When to stop.
     """
 
     runs: int = 10
     corrective: CorrectiveSettings = GP(samples=300)
-    options: AdaptiveSettings = AdaptiveSettings(most_rounds=15, method=METHOD)
+    settings: AdaptiveSettings = AdaptiveSettings(most_rounds=15, method=METHOD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def study(size: AdaptiveRobotSettings | None = None, seed: int = 0) -> AdaptiveS
     def fitted(known: Sequence[Trajectory]) -> DFSM:
         return surrogate(known, size.corrective)
 
-    result = optimize_adaptively(runs, fitted, problem, simulated, size.options)
+    result = optimize_adaptively(runs, fitted, problem, simulated, size.settings)
     return AdaptiveStudy(result, solve(problem(ROBOT), METHOD), len(runs))
 
 
