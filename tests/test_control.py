@@ -178,13 +178,15 @@ def test_periodic_motion_by_a_boundary_constraint():
 
 
 def test_problems_that_differ_in_numbers_share_compiled_code():
-    first = problem()
-    second = problem(disturbances=wind(0.7), final={"place": 3.0}, bounds={"force": (-9, 9)})
-    assert functions_of(second) is functions_of(first)
-    one, compiled = solved(first), functions_of(first).node._hessian._cache_size()
-    other = solved(second)
-    assert functions_of(second).node._hessian._cache_size() == compiled > 0
-    assert other.objective != one.objective
+    other = problem(disturbances=wind(0.7), final={"place": 3.0}, bounds={"force": (-9, 9)})
+    first = solved(problem())
+    node = functions_of(problem()).node
+    compiled = [f._cache_size() for f in (node._values, node._jacobian, node._hessian)]
+    second = solved(other)
+    assert functions_of(other).node is node
+    assert [f._cache_size() for f in (node._values, node._jacobian, node._hessian)] == compiled
+    assert min(compiled) > 0
+    assert second.objective != first.objective
 
 
 # -- surrogates ---------------------------------------------------------------------------------

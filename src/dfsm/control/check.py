@@ -201,8 +201,8 @@ def _prediction(solution: Solution, scenario: int, time: Array) -> Trajectory:
     """All channels of the solution at times in s; states and controls by its own polynomials."""
     full = solution.trajectories[scenario]
     time = np.clip(time, full.time[0], full.time[-1])
-    found = full.resample(time)
-    values = np.array(found.values)
+    resampled = full.resample(time)
+    values = np.array(resampled.values)
     parts = solution.at((time - full.time[0]) / full.duration, scenario)
     for role, part in zip(("state", "control"), parts, strict=True):
         values[:, [i for i, c in enumerate(full.channels) if c.role == role]] = part
@@ -236,7 +236,7 @@ def _figures(run: Trajectory, name: str, is_load: bool) -> Figures:
 def _limits(
     solution: Solution, nodes: Array, predicted: Trajectory, actual: Trajectory
 ) -> dict[str, LimitCheck]:
-    found = {}
+    checks = {}
     for name, pair in solution.bounds.items():
         channel = name.removeprefix(RATE)
         if channel not in actual:
@@ -255,13 +255,13 @@ def _limits(
         excess = [np.where(e > slack, e, 0.0) for e in excess]
         worst = int(np.argmax(excess[1]))
         most = float(excess[1][worst])
-        found[name] = LimitCheck(
+        checks[name] = LimitCheck(
             predicted=float(excess[0].max()),
             actual=most,
             at=float(time[worst]) if most > 0 else None,
             share=float(np.mean(excess[1] > 0)),
         )
-    return found
+    return checks
 
 
 def _between(time: Array, nodes: Array, limit: Array) -> Array:

@@ -19,8 +19,8 @@ _MOST = 3
 
 def worst_violation(program: Program, z: Array) -> float:
     """Largest violation of a constraint, relative to its size."""
-    found = violation(program.constraints(z), program.g_lower, program.g_upper)
-    return float(found.max(initial=0.0))
+    amounts = violation(program.constraints(z), program.g_lower, program.g_upper)
+    return float(amounts.max(initial=0.0))
 
 
 def conflict(program: Program, z: Array) -> str:
@@ -51,7 +51,7 @@ def conflict(program: Program, z: Array) -> str:
 
 def _held(program: Program, z: Array) -> list[str]:
     """Variables that are at a bound, those with the largest share of the horizon first."""
-    found = []
+    held = []
     for rows in program.variables:
         value, low, high = (a[rows.index] for a in (z, program.lower, program.upper))
         free = high > low
@@ -61,8 +61,8 @@ def _held(program: Program, z: Array) -> list[str]:
                 share = met.mean()
                 number = (limit * program.scale[rows.index])[met][0]
                 always = "" if len(met) == 1 else f" for {share:.0%} of the nodes"
-                found.append((share, f"{rows.name} ({side} bound {number:.4g}){always}"))
-    return [text for _, text in sorted(found, key=lambda f: -f[0])[:_MOST]]
+                held.append((share, f"{rows.name} ({side} bound {number:.4g}){always}"))
+    return [text for _, text in sorted(held, key=lambda h: -h[0])[:_MOST]]
 
 
 def _when(time: float) -> str:

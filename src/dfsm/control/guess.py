@@ -84,13 +84,13 @@ def _take_run(
     problem: OptimalControlProblem, guess: Trajectory, tau: Array, X: Array, U: Array
 ) -> None:
     time = guess.time[0] + tau * guess.duration
-    found = 0
+    taken = 0
     for group, values in (("states", X), ("controls", U)):
         for i, name in enumerate(problem.plant.names(group)):
             if name in guess:
                 values[:, :, i] = np.interp(time, guess.time, guess[name])
-                found += 1
-    if not found:
+                taken += 1
+    if not taken:
         raise DfsmError(
             f"guess {guess.where} holds none of the states and controls "
             f"{', '.join((*problem.plant.names('states'), *problem.plant.names('controls')))}"
@@ -149,6 +149,6 @@ def _near(value: float, low: float, high: float) -> float:
     return _middle((low, high)) if np.isfinite(high - low) else float(np.clip(value, low, high))
 
 
-def _middle(given: float | tuple[float, float]) -> float:
-    low, high = given if isinstance(given, tuple) else (given, given)
+def _middle(level: float | tuple[float, float]) -> float:
+    low, high = level if isinstance(level, tuple) else (level, level)
     return 0.5 * (float(low) + float(high))

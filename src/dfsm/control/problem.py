@@ -105,9 +105,9 @@ class OptimalControlProblem:
         if self.cost is None and self.final_cost is None:
             raise DfsmError(f"{self.name}: nothing to minimise: give a cost or a final_cost")
         if self.weights is not None:
-            count, given = len(self.scenarios), np.asarray(self.weights, dtype=float)
+            count, weights = len(self.scenarios), np.asarray(self.weights, dtype=float)
             require(
-                given.shape == (count,) and bool((given > 0).all()),
+                weights.shape == (count,) and bool((weights > 0).all()),
                 f"{self.name}: weights",
                 list(self.weights),
                 f"{count} positive numbers, one per scenario",
@@ -214,8 +214,8 @@ class OptimalControlProblem:
     def scenario_weights(self) -> Array:
         """Weights with a sum of 1, shape ``(scenario,)``."""
         count = len(self.scenarios)
-        given = np.ones(count) if self.weights is None else np.asarray(self.weights, dtype=float)
-        return given / given.sum()
+        weights = np.ones(count) if self.weights is None else np.asarray(self.weights, dtype=float)
+        return weights / weights.sum()
 
     def limits(self, name: str, time: Array) -> tuple[Array, Array]:
         """Lower and upper bound of a state, control or output at times in s, infinite if none."""
@@ -224,10 +224,10 @@ class OptimalControlProblem:
 
     def end_limits(self, which: str, name: str) -> tuple[float, float]:
         """Lower and upper bound of a state at the ``"initial"`` or ``"final"`` time."""
-        given = getattr(self, which).get(name, (None, None))
-        if is_number(given):
-            return float(given), float(given)
-        low, high = given
+        limits = getattr(self, which).get(name, (None, None))
+        if is_number(limits):
+            return float(limits), float(limits)
+        low, high = limits
         return (-np.inf if low is None else float(low), np.inf if high is None else float(high))
 
 
@@ -236,12 +236,12 @@ def is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float | np.number)
 
 
-def level(given: Level, name: str, time: Array, default: float) -> Array:
+def level(limit: Level, name: str, time: Array, default: float) -> Array:
     """Evaluate a limit at times in s.
 
     Parameters
     ----------
-    given
+    limit
         See `OptimalControlProblem.bounds`.
     name
         Channel to take from a run.
@@ -260,11 +260,11 @@ def level(given: Level, name: str, time: Array, default: float) -> Array:
     DfsmError
         The limit gives another number of values.
     """
-    if given is None:
+    if limit is None:
         return np.full(len(time), default)
-    if isinstance(given, Trajectory):
-        return given.select([name]).resample(time).values[:, 0]
-    value = np.asarray(given(time) if callable(given) else given, dtype=np.float64)
+    if isinstance(limit, Trajectory):
+        return limit.select([name]).resample(time).values[:, 0]
+    value = np.asarray(limit(time) if callable(limit) else limit, dtype=np.float64)
     if value.shape not in ((), np.shape(time)):
         raise DfsmError(
             f"a limit of '{name}' has shape {value.shape} at {len(time)} times: a function of time "
@@ -302,10 +302,10 @@ def _check_names(problem: OptimalControlProblem) -> None:
                 "value}, or a pair (low, high) to optimize it"
             )
     for place in ("constraints", "boundary"):
-        for key, given in getattr(problem, place).items():
-            if not (isinstance(given, tuple) and len(given) == 3 and callable(given[0])):
+        for key, entry in getattr(problem, place).items():
+            if not (isinstance(entry, tuple) and len(entry) == 3 and callable(entry[0])):
                 raise DfsmError(
-                    f"{name}: {place} '{key}' is {given!r}, expected (function, low, high)"
+                    f"{name}: {place} '{key}' is {entry!r}, expected (function, low, high)"
                 )
 
 
@@ -318,11 +318,11 @@ def _check_pairs(problem: OptimalControlProblem) -> None:
         ("final", True, _is_limit),
         ("parameters", True, is_number),
     ):
-        for key, given in getattr(problem, place).items():
-            pair = isinstance(given, tuple) and len(given) == 2 and all(map(limits, given))
-            if not (pair or (number and is_number(given))):
+        for key, value in getattr(problem, place).items():
+            pair = isinstance(value, tuple) and len(value) == 2 and all(map(limits, value))
+            if not (pair or (number and is_number(value))):
                 raise DfsmError(
-                    f"{problem.name}: {place} of '{key}' are {given!r}, expected "
+                    f"{problem.name}: {place} of '{key}' are {value!r}, expected "
                     + ("a number or " if number else "")
                     + "a pair (low, high)"
                 )
@@ -336,12 +336,12 @@ def _check_pairs(problem: OptimalControlProblem) -> None:
         )
 
 
-def _is_limit(given: object) -> bool:
-    return given is None or is_number(given)
+def _is_limit(value: object) -> bool:
+    return value is None or is_number(value)
 
 
-def _is_level(given: object) -> bool:
-    return _is_limit(given) or callable(given) or isinstance(given, Trajectory)
+def _is_level(value: object) -> bool:
+    return _is_limit(value) or callable(value) or isinstance(value, Trajectory)
 
 
 def _check_horizon(problem: OptimalControlProblem) -> None:
@@ -359,7 +359,7 @@ def _check_horizon(problem: OptimalControlProblem) -> None:
         )
     moving = [n for n, pair in problem.bounds.items() if not all(map(_constant, pair))]
     moving += [n for n, pair in problem.rates.items() if not all(map(_constant, pair))]
-    moving += [n for n, given in problem.constraints.items() if not all(map(_constant, given[1:]))]
+    moving += [n for n, c in problem.constraints.items() if not all(map(_constant, c[1:]))]
     if free is not None and moving:
         raise DfsmError(
             f"{name}: the limits of '{moving[0]}' vary in time, which needs a fixed last time: "
@@ -367,8 +367,8 @@ def _check_horizon(problem: OptimalControlProblem) -> None:
         )
 
 
-def _constant(given: Level) -> bool:
-    return given is None or not (callable(given) or isinstance(given, Trajectory))
+def _constant(limit: Level) -> bool:
+    return limit is None or not (callable(limit) or isinstance(limit, Trajectory))
 
 
 def _check_disturbances(problem: OptimalControlProblem) -> None:
@@ -393,10 +393,10 @@ def _check_limits(problem: OptimalControlProblem) -> None:
     """Refuse bounds that cross, ends outside bounds, and bounds outside the training region."""
     time = np.linspace(problem.start, problem.last_time, 201)
     for place in ("bounds", "rates", "constraints", "boundary"):
-        for key, given in getattr(problem, place).items():
+        for key, entry in getattr(problem, place).items():
             # A limit may be infinite but not undefined.
-            low = level(given[-2], key, time, -np.inf)
-            high = level(given[-1], key, time, np.inf)
+            low = level(entry[-2], key, time, -np.inf)
+            high = level(entry[-1], key, time, np.inf)
             crossed = ~(low <= high)
             if crossed.any():
                 at = int(np.argmax(crossed))
@@ -415,8 +415,8 @@ def _check_limits(problem: OptimalControlProblem) -> None:
                     f"bounds are {_told(below, above)}: no value meets both"
                 )
     for key in problem.free_parameters:
-        given = problem.parameters[key]
-        low, high = given if isinstance(given, tuple) else (given, given)
+        value = problem.parameters[key]
+        low, high = value if isinstance(value, tuple) else (value, value)
         if not (np.isfinite([low, high]).all() and low <= high):
             raise DfsmError(
                 f"{problem.name}: parameter '{key}' is to be in {_told(low, high)}, expected two "

@@ -50,7 +50,7 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
     size = np.where(size > 0, size, 1.0)
     shared = [*start.p, *([start.stop] if problem.free_time is not None else [])]
     p, _ = functions.unpack(jnp.asarray(shared), common_of(problem))
-    found = _integrate(
+    ends = _integrate(
         functions.plant.derivative,
         _pieces(grid, U),
         X[0],
@@ -60,7 +60,7 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
         np.array([problem.start, duration]),
         grid.scheme.points,
     )
-    states = np.concatenate([X[:1], np.asarray(found)[: grid.intervals].reshape(-1, X.shape[1])])
+    states = np.concatenate([X[:1], np.asarray(ends)[: grid.intervals].reshape(-1, X.shape[1])])
     gap = np.abs(states - X).max(axis=0)
     gap = np.where(np.isfinite(gap), gap, np.inf)
     channels = problem.plant.channels["states"]

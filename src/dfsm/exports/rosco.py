@@ -49,10 +49,10 @@ class RoscoInput:
 
     def lines(self) -> list[str]:
         """What to set, for people."""
-        found = ["DISCON.IN of ROSCO:"]
-        found += [f"  {value:<20} ! {name}" for name, value in self.discon.items()]
-        found.append("ServoDyn input file (ROSCO 2.10 gives every blade its pitch):")
-        return [*found, f"  {'1':<20} ! Ptch_Cntrl"]
+        lines = ["DISCON.IN of ROSCO:"]
+        lines += [f"  {value:<20} ! {name}" for name, value in self.discon.items()]
+        lines.append("ServoDyn input file (ROSCO 2.10 gives every blade its pitch):")
+        return [*lines, f"  {'1':<20} ! Ptch_Cntrl"]
 
 
 def write_rosco(
@@ -105,15 +105,15 @@ def write_rosco(
             f"in N m, kN m or MN m; its controls are {told}"
         )
     columns, heads, number = [run.time], ["Time (s)"], dict.fromkeys(chosen, 0)
-    for what, found in chosen.items():
-        if found is not None:
-            channel, factor = found
+    for what, control in chosen.items():
+        if control is not None:
+            channel, factor = control
             columns.append(factor * run[channel.name])
             heads.append(f"{channel.name} ({'rad' if what == 'pitch' else 'N m'})")
             number[what] = len(columns)
     path = Path(path)
     _write(path, solution.name, heads, np.column_stack(columns))
-    names = {what: None if found is None else found[0].name for what, found in chosen.items()}
+    names = {what: None if control is None else control[0].name for what, control in chosen.items()}
     discon = {
         "OL_Mode": "1",
         "OL_Filename": f'"{path.name}"',
@@ -147,17 +147,17 @@ def _chosen(
     if name is not None:
         if name not in run:
             raise DfsmError(f"{what}: no control '{name}'; {near_matches(name, run.names)}")
-        found = [run.channel(name)]
-        if plain(found[0].unit) not in units:
-            raise DfsmError(f"{what}: '{name}' is in '{found[0].unit}', expected {expected}")
+        known = [run.channel(name)]
+        if plain(known[0].unit) not in units:
+            raise DfsmError(f"{what}: '{name}' is in '{known[0].unit}', expected {expected}")
     else:
-        found = [c for c in run.channels if plain(c.unit) in units]
-    if len(found) > 1:
+        known = [c for c in run.channels if plain(c.unit) in units]
+    if len(known) > 1:
         raise DfsmError(
-            f"the {what} may be {' or '.join(c.name for c in found)}, all in units of {expected}: "
+            f"the {what} may be {' or '.join(c.name for c in known)}, all in units of {expected}: "
             f"name one with --{what}, or {what}= in Python"
         )
-    return (found[0], units[plain(found[0].unit)]) if found else None
+    return (known[0], units[plain(known[0].unit)]) if known else None
 
 
 def _write(path: Path, name: str, heads: list[str], values: Array) -> None:

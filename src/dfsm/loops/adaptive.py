@@ -120,14 +120,14 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveResult:
-    """What `optimize_adaptively` found.
+    """Where `optimize_adaptively` ended, and all rounds on the way.
 
     Attributes
     ----------
     status
         How it ended.
     solution, model
-        Of the best round: the optimum, and the surrogate that it was found on.
+        Of the best round: the optimum, and its surrogate.
     rounds
         All rounds, in order.
     best
@@ -210,32 +210,32 @@ def optimize_adaptively(
         models.append(fit(list(runs)))
         asked = problem(models[-1])
         require(len(asked.scenarios) == 1, "scenarios", len(asked.scenarios), "one")
-        found = solve(asked, settings.method, guess)
-        if not found.solved and guess is not None and found.ending is not Ending.INTERRUPTED:
+        solution = solve(asked, settings.method, guess)
+        if not solution.solved and guess is not None and solution.ending is not Ending.INTERRUPTED:
             # The last optimum of a poor surrogate can be a worse start than none.
-            found = solve(asked, settings.method)
-        rounds.append(_round(asked, found, simulator))
+            solution = solve(asked, settings.method)
+        rounds.append(_round(asked, solution, simulator))
         runs.append(rounds[-1].run)
-        guess = found if found.solved else None
+        guess = solution if solution.solved else None
         done = rounds[-1].difference <= settings.tolerance
-        if done or found.ending is Ending.INTERRUPTED:
+        if done or solution.ending is Ending.INTERRUPTED:
             break
     return _result(rounds, models, runs, settings)
 
 
 def _round(
-    problem: OptimalControlProblem, found: Solution, simulator: Callable[[Solution], Trajectory]
+    problem: OptimalControlProblem, solution: Solution, simulator: Callable[[Solution], Trajectory]
 ) -> Round:
     # Where a surrogate has no feasible point, the last iterate shows the next one what is wrong.
-    run = simulator(found)
-    costs = realised(problem, found, run)
-    if not found.solved:
-        return Round(found, run, costs, np.inf)
-    size = max(abs(found.objective), np.finfo(float).tiny)
-    gap = costs.cost - found.objective
+    run = simulator(solution)
+    costs = realised(problem, solution, run)
+    if not solution.solved:
+        return Round(solution, run, costs, np.inf)
+    size = max(abs(solution.objective), np.finfo(float).tiny)
+    gap = costs.cost - solution.objective
     if costs.at_most > _TRUSTED * size:
-        return Round(found, run, costs, (abs(gap) + costs.at_most) / size)
-    return Round(found, run, costs, abs(gap + costs.price) / size)
+        return Round(solution, run, costs, (abs(gap) + costs.at_most) / size)
+    return Round(solution, run, costs, abs(gap + costs.price) / size)
 
 
 def _result(
@@ -255,14 +255,14 @@ def _result(
     )
 
 
-def realised(problem: OptimalControlProblem, found: Solution, run: Trajectory) -> Realised:
+def realised(problem: OptimalControlProblem, solution: Solution, run: Trajectory) -> Realised:
     """Cost of a run of the true system, and the price of the final state that it missed.
 
     Parameters
     ----------
     problem
         Of one scenario.
-    found
+    solution
         Its solution.
     run
         The true system under the solution's controls: holds the problem's states, controls,
@@ -277,7 +277,7 @@ def realised(problem: OptimalControlProblem, found: Solution, run: Trajectory) -
     DfsmError
         The run lacks a channel, or does not last as long as the solution.
     """
-    span = found.trajectory.time
+    span = solution.trajectory.time
     if np.abs(run.time[[0, -1]] - span[[0, -1]]).max() > 1e-6 * (span[-1] - span[0]):
         raise DfsmError(
             f"{run.where}: lasts from {run.time[0]:g} s to {run.time[-1]:g} s, expected the "
@@ -285,9 +285,9 @@ def realised(problem: OptimalControlProblem, found: Solution, run: Trajectory) -
         )
     names = problem.plant.names("states")
     states = run.select(names).require_finite().values
-    cost = _cost(problem, found, run)
+    cost = _cost(problem, solution, run)
     miss, prices = dict[str, float](), list[float]()
-    costates = dict(zip(names, found.costates[0].select(names).values[-1], strict=True))
+    costates = dict(zip(names, solution.costates[0].select(names).values[-1], strict=True))
     for name, last in zip(names, states[-1], strict=True):
         if name in problem.final:
             low, high = problem.end_limits("final", name)
@@ -296,10 +296,10 @@ def realised(problem: OptimalControlProblem, found: Solution, run: Trajectory) -
     return Realised(cost, miss, sum(prices), sum(map(abs, prices)))
 
 
-def _cost(problem: OptimalControlProblem, found: Solution, run: Trajectory) -> float:
+def _cost(problem: OptimalControlProblem, solution: Solution, run: Trajectory) -> float:
     """M + ∫ L dt along a run."""
     plant = problem.plant
-    p = jnp.asarray([found.parameters[n] for n in plant.names("parameters")])
+    p = jnp.asarray([solution.parameters[n] for n in plant.names("parameters")])
     x, u, w = (
         jnp.asarray(run.select(plant.names(group)).values)
         for group in ("states", "controls", "disturbances")

@@ -1,6 +1,6 @@
 """Meshes of a scheme over the horizon, interpolation on them, and local errors.
 
-A mesh is given by its edges in normalised time τ, from 0 at the start of the horizon to 1 at its
+A mesh is its edges in normalised time τ, from 0 at the start of the horizon to 1 at its
 end; nodes are the scheme's points in every interval.
 """
 

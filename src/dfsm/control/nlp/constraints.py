@@ -57,11 +57,11 @@ def stacked(parts: Sequence[Part], which: str, width: int) -> sparse.csr_matrix:
     """One matrix of all parts, ``(row, width)``."""
     rows, columns, values, first = [], [], [], 0
     for part in parts:
-        found: Entries | None = getattr(part, which)
-        if found is not None:
-            rows.append(found[0] + first)
-            columns.append(found[1])
-            values.append(found[2])
+        elements: Entries | None = getattr(part, which)
+        if elements is not None:
+            rows.append(elements[0] + first)
+            columns.append(elements[1])
+            values.append(elements[2])
         first += len(part.low)
     if not rows:
         return sparse.csr_matrix((first, width))
@@ -71,11 +71,11 @@ def stacked(parts: Sequence[Part], which: str, width: int) -> sparse.csr_matrix:
 
 def named(parts: Sequence[Part]) -> list[Rows]:
     """Names of the rows of all parts, counted from the first of all."""
-    found, first = [], 0
+    rows, first = [], 0
     for part in parts:
-        found += [Rows(r.name, r.index + first, r.times) for r in part.rows]
+        rows += [Rows(r.name, r.index + first, r.times) for r in part.rows]
         first += len(part.low)
-    return found
+    return rows
 
 
 def program_of(
@@ -187,8 +187,8 @@ def boundary(layout: Layout, outputs: int) -> Part:
             level(below, name, none, -np.inf),
             level(above, name, none, np.inf),
         )
-        found = index[:, at].ravel()
-        rows.append(Rows(name, found, np.full(len(found), np.nan)))
+        at_rows = index[:, at].ravel()
+        rows.append(Rows(name, at_rows, np.full(len(at_rows), np.nan)))
         column += count
     source = np.arange(layout.scenarios)[:, None] * outputs + 1 + np.arange(shape[1])
     size = np.broadcast_to(sizes_of(low, high, (0,)), shape).ravel()

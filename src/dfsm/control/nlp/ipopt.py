@@ -230,5 +230,5 @@ def _quiet() -> Iterator[None]:
     except RuntimeError as error:
         first = str(error).strip().split("\n")[-1]
         raise DfsmError(
-            f"the nonlinear program could not be given to IPOPT ({first}): check sizes and limits"
+            f"the nonlinear program was refused by IPOPT ({first}): check sizes and limits"
         ) from error

@@ -75,7 +75,7 @@ class Layout:
 
     @cached_property
     def solved(self) -> IntArray:
-        """Which of the states are to be found."""
+        """Which of the states are solved for."""
         names = self.problem.plant.names("states")
         return np.array([i for i, n in enumerate(names) if n not in self.known], dtype=int)
 
@@ -165,8 +165,8 @@ class Layout:
             at = x[:, :, plant.names("states").index(name)]
             low[at] = high[at] = values
         for at, name in zip(q, self.problem.free_parameters, strict=False):
-            given = self.problem.parameters[name]
-            below, above = self._inside(name, *map(np.atleast_1d, given))  # pyright: ignore
+            pair = self.problem.parameters[name]
+            below, above = self._inside(name, *map(np.atleast_1d, pair))  # pyright: ignore
             low[at], high[at] = below[0], above[0]
         if self.problem.free_time is not None:
             low[q[-1]], high[q[-1]] = self.problem.free_time
@@ -237,15 +237,15 @@ class Layout:
     def names(self) -> list[Rows]:
         """What every variable is called, and when it is."""
         x, u, q = self.columns
-        found = []
+        rows = []
         for group, columns, nodes in (
             ("states", x, self.state_nodes),
             ("controls", u, self.control_nodes),
         ):
             for i, name in enumerate(self.problem.plant.names(group)):
                 times = np.tile(self.time[nodes], self.scenarios)
-                found.append(Rows(name, columns[:, nodes, i].ravel(), times))
+                rows.append(Rows(name, columns[:, nodes, i].ravel(), times))
         shared = [*self.problem.free_parameters, *(["the last time"] if self.free_time else [])]
         for at, name in zip(q, shared, strict=True):
-            found.append(Rows(name, np.array([at]), np.array([np.nan])))
-        return found
+            rows.append(Rows(name, np.array([at]), np.array([np.nan])))
+        return rows

@@ -199,13 +199,12 @@ class Program:
         return self.objective_scale * self._slopes(z)
 
     def variation(self, z: Array) -> float:
-        """How far f in physical units moves if variables move by their own values, to first order.
+        """How much f in physical units depends on the variables that can move, to first order.
 
-        Σ |zᵢ ∂f/∂zᵢ| over the variables that can move: twice the value of a quadratic cost, and the
-        same whatever constant is added to it.
+        ½ Σ |zᵢ ∂f/∂zᵢ|: the value of a quadratic cost, whatever constant is added to it.
         """
         moves = self.lower < self.upper
-        return float(np.abs(z * self._slopes(z))[moves].sum())
+        return 0.5 * float(np.abs(z * self._slopes(z))[moves].sum())
 
     def _slopes(self, z: Array) -> Array:
         parts = zip(self._gradients, self._derivatives(z), strict=True)

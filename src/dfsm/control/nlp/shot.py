@@ -38,7 +38,7 @@ class Shot(Protocol):
     grid: Grid
 
     def scaled(self, start: Start) -> Array:
-        """The solver's variables at given values, moved within their bounds."""
+        """The solver's variables of a start, moved within their bounds."""
         return self.program.scaled(self.layout.pack(start))
 
     @abstractmethod

@@ -90,11 +90,11 @@ class Term:
             return np.concatenate([a, np.repeat(a[-1:], extra, axis=0)]) if extra else a
 
         padded = jax.tree.map(pad, (z, *rest))
-        found = []
+        blocks = []
         for first in range(0, count, size):
             part = jax.tree.map(lambda a, k=first: a[k : k + size], padded)
-            found.append(np.asarray(function(part[0], part[1], common, *part[2:])))
-        return (found[0] if len(found) == 1 else np.concatenate(found))[:count]
+            blocks.append(np.asarray(function(part[0], part[1], common, *part[2:])))
+        return (blocks[0] if len(blocks) == 1 else np.concatenate(blocks))[:count]
 
 
 def block_length(count: int) -> int:
@@ -122,7 +122,7 @@ class Functions:
     """
 
     def __init__(self, problem: OptimalControlProblem) -> None:
-        # Kept alive, so that its id is not given to another while this is remembered.
+        # Kept alive, so that its id cannot be another's while this is remembered.
         self.model, self.plant = problem.model, problem.plant
         self.nx, self.nu = (len(self.plant.names(g)) for g in ("states", "controls"))
         # Where a parameter stands among the free ones; None for a fixed one.
@@ -148,7 +148,7 @@ class Functions:
         return p, q[-1] if self._timed else common["stop"]
 
     def disturbances(self, t: jax.Array, data: Any, common: Any) -> jax.Array:
-        """Those given with the row, or for a free last time those of the table at time t."""
+        """Those of the row, or for a free last time those of the table at time t."""
         if not self._timed:
             return data["w"]
         table = common["table"][data["scenario"]]

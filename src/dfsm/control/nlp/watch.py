@@ -39,7 +39,7 @@ class Watch:
         return 0
 
     def step(self, names: list[str]) -> Callable[..., Any]:
-        """Function that sees every iterate, given by name, and says whether to stop."""
+        """Function that sees every iterate, as values by name, and says whether to stop."""
         x, g, f, lam_g, lam_x = (names.index(k) for k in ("x", "g", "f", "lam_g", "lam_x"))
 
         def seen(*values: Array) -> tuple[float]:
