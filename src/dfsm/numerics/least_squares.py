@@ -6,11 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array
 
 # Rows per block of the accumulation: a block of tens of columns stays in the cache.
 BLOCK = 8192
+# Standard deviation relative to the mean at and below which an input does not vary.
+_STILL = 1e-12
 # Samples per independent one in a densely sampled time series.
 _CORRELATED = 100.0
 
@@ -66,6 +69,13 @@ class NormalEquations:
         offset = self.sums / self.count
         return np.sqrt(np.maximum(np.diag(self.products) / self.count - offset**2, 0.0))
 
+    @property
+    def still(self) -> NDArray[np.bool_]:
+        """Which inputs do not vary, but for rounding."""
+        m = self.n_inputs
+        mean = np.abs(self.moments(centred=True)[0][:m])
+        return self.std[:m] <= _STILL * np.maximum(mean, np.finfo(float).tiny)
+
     def solve(
         self, affine: bool, prior: Solution | None = None, held: Sequence[int] = ()
     ) -> Solution:
@@ -88,7 +98,7 @@ class NormalEquations:
         m = self.n_inputs
         scale = np.sqrt(np.maximum(np.diag(products)[:m], 0.0))
         # A column that does not vary gets no coefficient; any scale but zero will do.
-        still = scale <= 1e-12 * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)
+        still = scale <= _STILL * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)
         scale[still] = np.inf
         Q = products[:m, :m] / np.outer(scale, scale)
         # It is confounded with nothing, so it has no part in the condition number.
