@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 from dfsm.errors import DfsmError
 from dfsm.fitting.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
+from dfsm.numerics.least_squares import correlation_length
+from systems import wander
 
 NAMES = ["torque", "pitch", "wind", "x3"]
 
@@ -216,7 +220,7 @@ def test_lpv_windows_each_solve_their_own_least_squares():
     for k, (low, high) in enumerate(windows):
         inside = (s >= (low if k else -np.inf)) & (s <= (high if k < 3 else np.inf))
         L, b = reference(X[inside], Y[inside], True)
-        # They lean on the fit of all windows by one in a hundred samples' worth of what is left.
+        # They lean on the fit of all windows by one independent sample's worth of what is left.
         np.testing.assert_allclose(coefficients(fit, k)[0], L, rtol=0, atol=2e-3)
         np.testing.assert_allclose(coefficients(fit, k)[1], b, rtol=0, atol=2e-2)
         np.testing.assert_allclose(np.asarray(fit.model.grid)[k], s[inside].mean(), rtol=1e-12)
@@ -324,3 +328,73 @@ def test_a_schedule_of_few_distinct_values_gives_a_finite_model():
         assert np.isfinite(b).all()
     for value in (6.0, 12.0, 18.0):
         np.testing.assert_allclose(fit.model.at(value)[0][0, 0], value, atol=1e-4)
+
+
+# -- how many samples are independent ------------------------------------------------------------
+
+
+def coloured(rng: np.random.Generator, n: int, memory: float) -> np.ndarray:
+    """First-order autoregressive noise of variance one; `memory` in samples."""
+    a = np.exp(-1 / memory)
+    return lfilter([np.sqrt(1 - a**2)], [1, -a], rng.normal(size=n + 2000))[2000:]
+
+
+def test_white_noise_counts_sample_by_sample():
+    noise = np.random.default_rng(0).normal(size=(20_000, 5))
+    np.testing.assert_allclose(correlation_length(noise), 1.0, atol=0.05)
+    alternating = noise[1:] - noise[:-1]
+    np.testing.assert_allclose(correlation_length(alternating), 1.0)
+
+
+@pytest.mark.parametrize("memory", [3.0, 30.0])
+def test_coloured_noise_counts_by_its_autocorrelation(memory):
+    rng = np.random.default_rng(0)
+    a = np.exp(-1 / memory)
+    noise = np.stack([coloured(rng, 100_000, memory) for _ in range(6)], axis=1)
+    expected = (1 + a) / (1 - a)
+    np.testing.assert_allclose(correlation_length(noise), expected, rtol=0.2)
+    # The variance of a mean is what it says.
+    means = noise[: 100_000 // 2000 * 2000].reshape(-1, 2000, 6).mean(axis=1)
+    assert means.var() == pytest.approx(expected / 2000, rel=0.3)
+
+
+def test_a_series_that_never_forgets_counts_once():
+    ramp = np.linspace(-1, 1, 500)[:, None]
+    assert 100 < correlation_length(ramp)[0] <= 500
+    np.testing.assert_array_equal(correlation_length(np.zeros((10, 2))), 1.0)
+
+
+def starved(rate: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Six runs in which the pitch hardly moves in strong wind, at so many samples per second.
+
+    The runs are the same at any rate: sums of sines, and noise that remembers two seconds.
+    """
+    blocks = []
+    time, fine = np.arange(0, 200, 1 / rate), np.arange(0, 201, 0.1)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        drive = [wander(rng, 0.0, 3.0, 1.5)(time) for _ in range(3)]
+        wind = 10 + wander(rng, 0.0, 12.0, 0.3)(time)
+        drive[1] = np.where(wind > 9.5, 0.02, 1.0) * drive[1]
+        noise = CubicSpline(fine, coloured(rng, len(fine), 20.0))(time)
+        X = np.stack([drive[0], drive[1], wind, drive[2]], axis=1)
+        y = X[:, 0] + (4 - 0.2 * wind) * X[:, 1] - X[:, 3] + noise
+        blocks.append((X, y[:, None]))
+    return blocks
+
+
+def test_the_sampling_rate_hardly_matters_to_a_window_that_starves():
+    windows = np.array([[0.0, 10.0], [7.0, 13.0], [10.0, 20.0]])
+    choice = LPV(schedule="wind", points=3)
+    fits = {rate: fit_linear(starved(rate), NAMES, choice, windows) for rate in (10, 20, 40)}
+    found = {rate: np.asarray(f.model.coefficients) for rate, f in fits.items()}
+    for rate in (10, 40):
+        np.testing.assert_allclose(found[rate], found[20], rtol=0, atol=0.02)
+    # It is one that leans: its own least squares are somewhere else.
+    X, y = (np.concatenate(part) for part in zip(*starved(20), strict=True))
+    inside = X[:, WIND] >= 10
+    own, _ = reference(X[inside], y[inside], True)
+    assert abs(found[20][2, 0, 1] - own[0, 1]) > 0.1
+    independent = {rate: f.equations[2].independent[0] for rate, f in fits.items()}
+    assert independent[40] == pytest.approx(independent[10], rel=0.1)
+    assert independent[20] < 0.1 * fits[20].samples[2]

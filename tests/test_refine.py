@@ -306,6 +306,18 @@ def test_growth_of_a_start_that_is_unstable_is_left_alone(biased):
     assert not kept.normal_equations(zero)[0].any()
 
 
+def test_growth_where_eigenvalues_meet_is_finite(biased):
+    """Two eigenvalues at -0.001 1/s with one eigenvector: past the margin, and without a slope."""
+    L = biased.f.coefficients.at[0, 1, 1:3].set(jnp.array([-(0.001**2), -0.002]))
+    kept = StabilityKept(
+        Parametrization.of(replace(biased, f=replace(biased.f, coefficients=L)), np.ones(2)), 1000
+    )
+    zero = np.zeros(4)
+    assert 0 < kept.cost(zero) < np.inf
+    for part in kept.normal_equations(zero):
+        assert np.isfinite(part).all()
+
+
 def test_a_network_is_added_that_changes_nothing_yet(runs, biased):
     added = start_network(biased, 5, np.array([1.0, 3.0]), 0)
     before, after = (simulate(m, runs[0]).trajectory.values for m in (biased, added))

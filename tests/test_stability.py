@@ -10,12 +10,17 @@ import pytest
 from scipy.optimize import minimize
 
 from dfsm.core.types import Array
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
 from dfsm.fitting.linear import LPV, LTI, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.stabilize import stabilise, state_matrix
 from dfsm.models.corrective import GaussianUnits
-from dfsm.models.stability import destabilised, fastest_growth
-from systems import OSCILLATOR_A, linear_model
+from dfsm.models.stability import destabilised, eigen, fastest_growth
+from systems import OSCILLATOR_A, Q, System, U, V, linear_model
 
 # Inputs [u, w, x1, x2, v1, v2]; x' = v is known, v' is fitted.
 NAMES = ["u", "w", "x1", "x2", "v1", "v2"]
@@ -184,3 +189,90 @@ def test_mixtures_of_schedule_points_are_stable_too() -> None:
     stable, moved = stabilise(plain, columns, {}, 0.1, affine=True)
     assert fastest_growth(stable.model, columns) <= -0.1
     assert len(moved) == 2
+
+
+# -- eigenvalues that meet ----------------------------------------------------------------------
+
+INTEGRATORS = System(
+    (Q, V),
+    (U,),
+    (Channel("y", "m"),),
+    f=lambda x, v: np.stack([x[1], v[0]]),
+    g=lambda x, v: x[:1],
+)
+
+
+def test_slopes_of_eigenvalues_against_differences() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        A, change = rng.normal(size=(2, 4, 4))
+        values, left, right = eigen(A)
+        slopes = [w.conj() @ change @ v for w, v in zip(left, right, strict=True)]
+        step = 1e-6
+        there, back = (np.linalg.eigvals(A + h * change) for h in (step, -step))
+        for value, slope in zip(values, slopes, strict=True):
+            after, before = (some[np.argmin(abs(some - value))] for some in (there, back))
+            assert slope == pytest.approx((after - before) / (2 * step), rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        np.diag(np.ones(1), 1),
+        np.diag(np.ones(3), 1),
+        np.diag(np.ones(1), 1) + 1e-13 * np.array([[0, 0], [1, -2]]),
+        np.zeros((3, 3)),
+        np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 2.0]]),
+    ],
+)
+def test_eigenvectors_of_a_jordan_block_are_finite(A: Array) -> None:
+    values, left, right = eigen(A)
+    for found in (values, left, right):
+        assert np.isfinite(found).all()
+    assert np.abs(left).max() < 1e9
+    # They are left and right eigenvectors all the same.
+    np.testing.assert_allclose(A @ right.T, right.T * values, atol=1e-6)
+    sizes = np.linalg.norm(left, axis=1)[:, None]
+    np.testing.assert_allclose(
+        left.conj() / sizes @ A, values[:, None] * left.conj() / sizes, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("margin", [0.01, 0.1, 1.0])
+def test_a_double_integrator_can_be_made_stable(margin: float) -> None:
+    """A = [[0, 1], [0, 0]] has one eigenvector; both eigenvalues must go."""
+    runs = INTEGRATORS.many(4, [(0.0, 1.0)], np.arange(0, 10.01, 0.05))
+    settings = FitSettings(
+        states=(StateSpec(name="q", order=2, rate="v"),),
+        controls=("u",),
+        linear=LTI(margin=margin),
+        corrective=NoCorrection(),
+        nonlinear_only=False,
+    )
+    model = fit(runs, settings).model
+    ((_, values),) = model.eigenvalues()
+    assert values.real.max() <= -margin
+    # Not further than needed: the cheapest pair of a given decay lies on the margin.
+    assert values.real.min() > -3 * margin
+    (note,) = [c for c in model.provenance.record["checks"] if "eigenvalues were moved" in c]
+    assert f"-{margin:g} 1/s" in note
+
+
+def test_two_double_integrators_can_be_made_stable() -> None:
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(4000, 6)) * [1, 1, 3, 0.5, 1, 2]
+    targets = inputs[:, :2] @ np.array([[1.0, 0.2], [0.1, 2.0]])
+    plain = fit_linear([(inputs, targets)], NAMES, LTI())
+    stable, moved = stabilise(plain, COLUMNS, KNOWN, 0.1, affine=True)
+    assert moved == [0.0]
+    assert max(eigenvalues(stable)[0]) <= -0.1
+
+
+def test_a_state_that_never_varies_is_told() -> None:
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(500, 6))
+    inputs[:, 3] = inputs[:, 5] = 0.0
+    targets = rng.normal(size=(500, 2))
+    plain = fit_linear([(inputs, targets)], NAMES, LTI())
+    with pytest.raises(DfsmError, match=r"linear\.margin needs runs in which all states vary"):
+        stabilise(plain, COLUMNS, KNOWN, 0.1, affine=True)

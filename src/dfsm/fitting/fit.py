@@ -25,6 +25,7 @@ from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed, near_matches
+from dfsm.fitting.contraction import contraction
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.gate import correct
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
@@ -42,8 +43,9 @@ from dfsm.models.stability import destabilised
 from dfsm.refinement.refine import RefineSettings, refine
 from dfsm.simulation.simulate import Status, simulate
 
-# Training runs that are simulated to check a new model.
-_CHECK_RUNS = 8
+# Training runs that are simulated to check a new model, and those of them along which pairs of
+# rollouts from different initial states are followed.
+_CHECK_RUNS, _PAIRED_RUNS = 8, 3
 
 
 @dataclass(frozen=True)
@@ -308,7 +310,10 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
 def _check(
     model: DFSM, samples: Samples, data: Dataset, settings: FitSettings
 ) -> tuple[list[str], list[str]]:
-    """Look for what would surprise a user: non-finite values, instability, leaking disturbances."""
+    """Look for what would surprise a user: non-finite values, instability, leaking disturbances.
+
+    Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
+    """
     notes = data_warnings(data, settings)
     x, u, w, p = model.split(samples.inputs)
     values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
@@ -336,7 +341,26 @@ def _check(
             (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended
         )
         notes.append(f"only {checks[0]}; {worst.trajectory.name}: {worst.reason}")
+    few = slice(None, None, -(-len(some) // _PAIRED_RUNS))
+    outcome = contraction(model, some[few], rollouts[few], settings.start, settings.stop)
+    if outcome is not None:
+        checks.append(outcome.account)
+        if outcome.unexpected:
+            notes.append(f"{outcome.account}, although {_unexpected(model)}")
     return notes, checks
+
+
+def _unexpected(model: DFSM) -> str:
+    """What ought to have made states come together, and what to do where it did not."""
+    if model.schedule:
+        return (
+            f"every linear fit is stable with {model.schedule} frozen: as it moves, the model is "
+            "not; use fewer linear.points, a larger linear.margin or another linear.schedule"
+        )
+    return (
+        "the linear fit is stable: right for a system with several equilibria; for any other set "
+        "linear.margin, or correct less (gate, corrective)"
+    )
 
 
 def _record(

@@ -6,6 +6,10 @@ One pass over the data accumulates the normal equations of every scheduling wind
 not grow with the number of samples. Windows overlap; between their centres the coefficients are
 interpolated linearly, so the model is continuous in the schedule and every L(w) is a convex
 combination of two fitted ones.
+
+A window's fit leans on that of all windows by what one independent sample weighs. How many samples
+make one is learnt in the same pass, from the residuals of each block's own fit: how long they
+remember is a property of the time series, not of its sampling rate.
 """
 
 from __future__ import annotations
@@ -22,7 +26,14 @@ from dfsm.core.settings import settings_class
 from dfsm.core.types import Array, IntArray
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.linear import LinearModel
-from dfsm.numerics.least_squares import BLOCK, NormalEquations, Solution, merge, shared_coefficients
+from dfsm.numerics.least_squares import (
+    BLOCK,
+    NormalEquations,
+    Solution,
+    correlation_length,
+    merge,
+    shared_coefficients,
+)
 
 # Two input directions whose standardised spread differs by more than this cannot be told apart
 # by least squares in 64-bit normal equations with a few digits to spare.
@@ -170,7 +181,7 @@ def fit_linear(
     ----------
     blocks
         Pairs of inputs ``(sample, input)`` and targets ``(sample, target)``, one pair per run or
-        part of one. They are read once and not kept.
+        part of one, in the order of time. They are read once and not kept.
     input_names
         Names of the input columns, for the schedule and for messages.
     settings
@@ -178,7 +189,7 @@ def fit_linear(
     windows
         Schedule windows from `schedule_windows`; needed for an LPV fit.
     known
-        Coefficients that are given, by target and input.
+        Coefficients that are not fitted, by target and input.
 
     Returns
     -------
@@ -204,20 +215,20 @@ def fit_linear(
         if not lpv:
             sums[0].add(inputs, targets)
             continue
-        s = inputs[:, column]
+        s, correlation = inputs[:, column], _correlation(inputs, targets, sums[0].shift, settings)
         for k, (low, high) in enumerate(windows):
             inside = (s >= low) & (s <= high)
             # The end windows also take what lies beyond them: no sample is left out.
             inside |= (s < low) & (k == 0) | (s > high) & (k == len(windows) - 1)
-            sums[k].add(inputs[inside], targets[inside])
+            sums[k].add(inputs[inside], targets[inside], correlation)
             schedule_sums[k] += s[inside].sum()
     _check_counts(sums, windows, settings)
     whole = merge(sums).solve(settings.affine)
     known = known or {}
     constant = _constant(settings, input_names, known)
     if constant:
-        given = {(t, constant.index(i)): value for (t, i), value in known.items()}
-        shared = shared_coefficients(sums, constant, settings.affine, given)
+        by_place = {(t, constant.index(i)): value for (t, i), value in known.items()}
+        shared = shared_coefficients(sums, constant, settings.affine, by_place)
         whole = merge(sums).holding(whole, constant, shared, settings.affine)
     solutions = [e.solve(settings.affine, whole, constant) for e in sums] if lpv else [whole]
     counts = np.array([e.count for e in sums])
@@ -243,6 +254,16 @@ def fit_linear(
         warnings=_warnings(whole, input_names),
         constant=constant,
     )
+
+
+def _correlation(inputs: Array, targets: Array, shift: Array, settings: LTI | LPV) -> Array:
+    """How many samples of a block count as one, by target: all, where it is too short to tell."""
+    if len(inputs) <= 2 * inputs.shape[1]:
+        return np.full(targets.shape[1], float(len(inputs)))
+    own = NormalEquations(shift, inputs.shape[1])
+    own.add(inputs, targets)
+    fit = own.solve(settings.affine)
+    return correlation_length(targets - inputs @ fit.coefficients.T - fit.offset)
 
 
 def _constant(

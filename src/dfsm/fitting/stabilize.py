@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
@@ -21,6 +22,12 @@ from dfsm.models.stability import eigen, growth_between
 
 _STEPS = 200
 _ROUNDS = 20
+# How far beyond the margin eigenvalues are aimed at first, relative to it, and by how much further
+# in every step: where eigenvalues meet, a step throws some of them back, the less the further left
+# they are. Those within so many aims of the margin are held left of it.
+_AIM, _FURTHER, _NEAR = 1e-3, 1.03, 100
+# A row is never taken to be better known than this, relative to its standard deviation squared.
+_LEAST_VARIANCE = 1e-12
 
 
 def state_matrix(coefficients: Array, columns: slice, known: Mapping[int, int]) -> Array:
@@ -48,6 +55,10 @@ def stabilise(
 ) -> tuple[LinearFit, list[float]]:
     """Move eigenvalues right of ``-margin`` onto it, and refit everything else.
 
+    Stable is meant with the schedule frozen, at every value of it. Where the schedule moves as fast
+    as the states do, that neither implies that states come together along its path nor is it
+    implied by that; `fit` looks at recorded paths, too.
+
     The fitted rows of A change in the way that costs the least fit quality; kinematic rows stay.
     Coefficients of all inputs that are not states are then fitted again with A held. Where two
     stable points leave an unstable mixture between them, both are moved further.
@@ -73,7 +84,8 @@ def stabilise(
     Raises
     ------
     DfsmError
-        A margin that is not positive, or a mode that cannot be moved.
+        A margin that is not positive, a mode that cannot be moved, or a state that does not vary,
+        so that nothing tells what a change of its coefficients costs.
     """
     if not margin > 0:
         raise DfsmError(f"linear.margin is {margin:g}, expected a positive number of 1/s, or null")
@@ -87,7 +99,7 @@ def stabilise(
         for k in np.flatnonzero(excess > 0):
             margins[k : k + 2] += 1.5 * excess[k]
     raise DfsmError(
-        "no fit was found that is stable between the schedule points too: use fewer linear.points, "
+        "no linear fit is stable between the schedule points too: use fewer linear.points, "
         "or a smaller linear.margin"
     )
 
@@ -114,9 +126,17 @@ def _stable_points(
         variance[k] = equations.complete(held, fixed, affine)[2]
         if np.linalg.eigvals(A).real.max() <= -margin:
             continue
+        if equations.still[columns].any():
+            raise DfsmError(
+                "linear.margin needs runs in which all states vary, but one never does, so that "
+                "nothing tells what a change of its coefficients costs: leave out that state or "
+                "the margin, or add runs"
+            )
         moved.append(float(fit.model.grid[k]))
         metric = equations.partial_covariance(columns, affine)
-        fixed[:, :n] += _change(A, rows, metric, variance[k], margin, free)
+        least = _LEAST_VARIANCE * equations.std[equations.n_inputs :] ** 2
+        known_to = np.maximum(variance[k], np.maximum(least, np.finfo(float).tiny))
+        fixed[:, :n] += _change(A, rows, metric, known_to, margin, free)
         coefficients[k], offsets[k], variance[k] = equations.complete(held, fixed, affine)
     share = fit.samples / fit.samples.sum()
     model = replace(fit.model, coefficients=jnp.asarray(coefficients), offsets=jnp.asarray(offsets))
@@ -135,18 +155,17 @@ def _change(
     dλ = wᴴ dA v with the left and right eigenvectors w and v.
     """
     total = np.zeros((len(rows), len(A)))
-    inverses = np.zeros((len(rows), *metric.shape))
-    for k, own in enumerate(free):
-        inverses[k][np.ix_(own, own)] = np.linalg.inv(metric[np.ix_(own, own)])
+    inverses = np.stack([_inverse(metric, own) for own in free])
+    aim = _AIM * margin
     for _ in range(_STEPS):
         current = A.copy()
         current[rows] += total
         eigenvalues, left, right = eigen(current)
-        # One of each conjugate pair; aiming a little further makes the last step land inside.
-        active = (eigenvalues.real > -margin) & (eigenvalues.imag >= 0)
-        if not active.any():
+        if (eigenvalues.real <= -margin).all():
             return total
-        wanted = -(eigenvalues.real[active] + margin) - 1e-3 * margin
+        # One of each conjugate pair.
+        active = (eigenvalues.real > -margin - _NEAR * aim) & (eigenvalues.imag >= 0)
+        wanted = -(eigenvalues.real[active] + margin + aim)
         M = [
             np.real(w[rows].conj()[:, None] * v)
             for w, v in zip(left[active], right[active], strict=True)
@@ -158,7 +177,18 @@ def _change(
         # Eigenvalues are nonlinear in A: no step may be a large part of the matrix.
         size, most = np.linalg.norm(step), 0.2 * (np.linalg.norm(A[rows]) + margin)
         total = total + (step if size <= most else step * most / size)
+        aim *= _FURTHER
     raise DfsmError(
         "no stable linear fit was found near the least-squares one: make linear.margin smaller, "
         "leave it out, or look at the eigenvalues and choose other states or linear.known"
     )
+
+
+def _inverse(metric: Array, free: NDArray[np.bool_]) -> Array:
+    """Inverse of the block of some states, zero elsewhere."""
+    inverse = np.zeros_like(metric)
+    block = metric[np.ix_(free, free)]
+    scale = np.sqrt(np.diag(block))
+    size = np.outer(scale, scale)
+    inverse[np.ix_(free, free)] = np.linalg.inv(block / size) / size
+    return inverse

@@ -18,6 +18,9 @@ from dfsm.models.linear import LinearModel
 
 # Between two schedule points A is a mixture of theirs; that many mixtures are examined.
 _MIXTURES = 9
+# Cosine between left and right eigenvectors below which eigenvalues count as shared: eigenvalues
+# that rounding has split lie its root apart.
+_DEFECTIVE = float(np.sqrt(np.finfo(float).eps))
 # A corrective function is examined at so many places from one operating point to the next.
 _PLACES = 4
 
@@ -44,10 +47,30 @@ def growth_between(A: Array, B: Array) -> float:
 
 
 def eigen(A: Array) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Eigenvalues, left and right eigenvectors as rows, scaled so that wᴴ v = 1."""
-    found: Any = eig(A, left=True, right=True)
-    eigenvalues, left, right = found[0], found[1].T, found[2].T
-    scale = np.sum(left.conj() * right, axis=1)
+    """Eigenvalues with left and right eigenvectors, from which their slopes follow.
+
+    dλ = wᴴ dA v with wᴴ v = 1. Where eigenvalues meet and share one eigenvector, as those of a
+    double integrator do, wᴴ v = 0: they move like a root of the change, and have no slope. There,
+    and as near to it as rounding can tell, w stops growing: a large but finite slope along the
+    change that splits them.
+
+    Parameters
+    ----------
+    A
+        Shape ``(state, state)``.
+
+    Returns
+    -------
+    tuple of ndarray
+        λ, shape ``(state,)``, and w and v as rows, ``(state, state)``.
+    """
+    solution: Any = eig(A, left=True, right=True)
+    eigenvalues, left, right = solution[0], solution[1].T, solution[2].T
+    # Cosine of the angle between vectors of length one: the eigenvalue's reciprocal condition.
+    cosine = np.sum(left.conj() * right, axis=1)
+    size = np.abs(cosine)
+    phase = np.where(size > 0, cosine, 1.0) / np.where(size > 0, size, 1.0)
+    scale = phase * np.maximum(size, _DEFECTIVE)
     return eigenvalues, left / scale.conj()[:, None], right
 
 
@@ -94,5 +117,5 @@ def operating_points(model: DFSM) -> tuple[Array, Array]:
     grid, operating = np.asarray(model.region.grid), np.asarray(model.region.operating)
     places = np.arange((len(grid) - 1) * _PLACES + 1) / _PLACES
     table = np.column_stack([grid, operating]).T
-    found = np.stack([np.interp(places, np.arange(len(grid)), row) for row in table], axis=1)
-    return found[:, 0], found[:, 1:]
+    points = np.stack([np.interp(places, np.arange(len(grid)), row) for row in table], axis=1)
+    return points[:, 0], points[:, 1:]

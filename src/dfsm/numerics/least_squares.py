@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array
 
 # Rows per block of the accumulation: a block of tens of columns stays in the cache.
 BLOCK = 8192
-# Samples per independent one in a densely sampled time series.
-_CORRELATED = 100.0
+# Standard deviation relative to the mean at and below which an input does not vary.
+_STILL = 1e-12
 
 
 class NormalEquations:
@@ -34,11 +35,20 @@ class NormalEquations:
         self.shift = np.asarray(shift, dtype=np.float64)
         self.n_inputs = n_inputs
         self.count = 0
+        self.independent = np.zeros(len(self.shift) - n_inputs)
         self.sums = np.zeros(len(self.shift))
         self.products = np.zeros((len(self.shift), len(self.shift)))
 
-    def add(self, inputs: Array, targets: Array) -> None:
-        """Add samples: `inputs` ``(sample, input)`` and `targets` ``(sample, target)``."""
+    def add(self, inputs: Array, targets: Array, correlation: Array | float = 1.0) -> None:
+        """Add samples.
+
+        Parameters
+        ----------
+        inputs, targets
+            Shapes ``(sample, input)`` and ``(sample, target)``.
+        correlation
+            How many samples of each target count as one, see `correlation_length`.
+        """
         # Channels as rows: contiguous, so that the product runs at the speed of the memory.
         block = np.empty((len(self.shift), BLOCK))
         m = self.n_inputs
@@ -50,6 +60,7 @@ class NormalEquations:
             self.products += z @ z.T
             self.sums += z.sum(axis=1)
         self.count += len(inputs)
+        self.independent += len(inputs) / np.asarray(correlation)
 
     def moments(self, centred: bool) -> tuple[Array, Array]:
         """Return the mean, and the mean products about it (about zero if not `centred`)."""
@@ -65,6 +76,13 @@ class NormalEquations:
         """Standard deviation of every input and target."""
         offset = self.sums / self.count
         return np.sqrt(np.maximum(np.diag(self.products) / self.count - offset**2, 0.0))
+
+    @property
+    def still(self) -> NDArray[np.bool_]:
+        """Which inputs do not vary, but for rounding."""
+        m = self.n_inputs
+        mean = np.abs(self.moments(centred=True)[0][:m])
+        return self.std[:m] <= _STILL * np.maximum(mean, np.finfo(float).tiny)
 
     def solve(
         self, affine: bool, prior: Solution | None = None, held: Sequence[int] = ()
@@ -88,7 +106,7 @@ class NormalEquations:
         m = self.n_inputs
         scale = np.sqrt(np.maximum(np.diag(products)[:m], 0.0))
         # A column that does not vary gets no coefficient; any scale but zero will do.
-        still = scale <= 1e-12 * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)
+        still = scale <= _STILL * np.maximum(np.abs(mean[:m]), np.finfo(float).tiny)
         scale[still] = np.inf
         Q = products[:m, :m] / np.outer(scale, scale)
         # It is confounded with nothing, so it has no part in the condition number.
@@ -117,20 +135,20 @@ class NormalEquations:
         """Ridge towards `prior`, weighted by its input variances.
 
         The weight is the share of the target that these samples' `own` fit leaves over, so that
-        data without noise are not biased, over the number of independent samples, taken as one
-        in a hundred.
+        data without noise are not biased, over the number of independent samples: as many as the
+        time that they cover holds of the time that a residual remembers, at any sampling rate.
         """
         m = self.n_inputs
         Q, right = products[:m, :m], products[:m, m:]
         target_variance = np.maximum(np.diag(products)[m:], np.finfo(float).tiny)
         share = np.minimum(own.residual_variance / target_variance, 1.0)
-        weight = share * min(1.0, _CORRELATED / self.count)
-        given = np.array(held, dtype=int)
-        free = np.delete(np.arange(m), given)
+        weight = share / np.maximum(self.independent, 1.0)
+        fixed = np.array(held, dtype=int)
+        free = np.delete(np.arange(m), fixed)
         pull = np.diag(prior.input_variance[free])
         L = prior.coefficients.copy()
         for t, w in enumerate(np.maximum(weight, 1e-12)):
-            rest = right[free, t] - Q[np.ix_(free, given)] @ L[t, given]
+            rest = right[free, t] - Q[np.ix_(free, fixed)] @ L[t, fixed]
             A, b = Q[np.ix_(free, free)] + w * pull, rest + w * pull @ prior.coefficients[t, free]
             L[t, free] = np.linalg.lstsq(A, b, rcond=None)[0]
         rss = np.diag(products)[m:] - np.einsum("ij,ji->j", 2 * right - Q @ L.T, L)
@@ -158,21 +176,21 @@ class NormalEquations:
         return partial * np.outer(scale[columns], scale[columns])
 
     def holding(
-        self, found: Solution, columns: Sequence[int], fixed: Array, affine: bool
+        self, solution: Solution, columns: Sequence[int], fixed: Array, affine: bool
     ) -> Solution:
-        """A solution with some inputs' coefficients given and the best others; see `complete`."""
+        """A solution with some inputs' coefficients fixed and the best others; see `complete`."""
         L, offset, rss = self.complete(columns, fixed, affine)
-        return replace(found, coefficients=L, offset=offset, residual_variance=rss)
+        return replace(solution, coefficients=L, offset=offset, residual_variance=rss)
 
     def complete(
         self, columns: Sequence[int], fixed: Array, affine: bool
     ) -> tuple[Array, Array, Array]:
-        """Best remaining coefficients when those of some inputs are given.
+        """Best remaining coefficients where those of some inputs are fixed.
 
         Parameters
         ----------
         columns
-            The inputs whose coefficients are given.
+            The inputs whose coefficients are fixed.
         fixed
             Those coefficients, shape ``(target, len(columns))``.
         affine
@@ -224,11 +242,39 @@ class Solution:
         return [names[i] for i in np.argsort(-weight) if weight[i] > 0.3 * weight.max()]
 
 
+def correlation_length(residuals: Array) -> Array:
+    """Samples of a time series per independent one: its autocorrelation, summed up.
+
+    ``τ = 1 + 2 Σ ρ_k`` until ρ first falls to zero, beyond which an estimate is mostly noise (the
+    variance of a mean is τ times that of as many independent samples; Priestley 1981, Sec. 5.3).
+    Times the sampling step it is a time, which does not depend on the sampling rate.
+
+    Parameters
+    ----------
+    residuals
+        Equidistant samples, shape ``(sample, target)``.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(target,)``: 1 for white noise, at most the number of samples.
+    """
+    n = len(residuals)
+    centred = residuals - residuals.mean(axis=0)
+    # Twice the length, so that the end does not meet the beginning.
+    power = np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2
+    covariance = np.fft.irfft(power, 2 * n, axis=0)[:n]
+    rho = covariance / np.maximum(covariance[0], np.finfo(float).tiny)
+    positive = np.logical_and.accumulate(rho > 0, axis=0)
+    return np.clip(2 * np.sum(rho * positive, axis=0) - 1, 1.0, n)
+
+
 def merge(parts: Sequence[NormalEquations]) -> NormalEquations:
     """Add up sums that were taken about the same shift."""
     total = NormalEquations(parts[0].shift, parts[0].n_inputs)
     for part in parts:
         total.count += part.count
+        total.independent += part.independent
         total.sums += part.sums
         total.products += part.products
     return total
@@ -238,7 +284,7 @@ def shared_coefficients(
     parts: Sequence[NormalEquations],
     columns: Sequence[int],
     affine: bool,
-    given: Mapping[tuple[int, int], float] | None = None,
+    known: Mapping[tuple[int, int], float] | None = None,
 ) -> Array:
     """Least-squares coefficients of some inputs that all parts share; the others are free in each.
 
@@ -250,7 +296,7 @@ def shared_coefficients(
         The inputs in question.
     affine
         Every part has an offset of its own.
-    given
+    known
         Some of them, which are not fitted, by target and place in `columns`.
 
     Returns
@@ -272,12 +318,12 @@ def shared_coefficients(
         out = out / scale[:, None]
         left += part.count * (products[np.ix_(some, some)] - out.T @ products[rest][:, some])
         right += part.count * (products[some, m:] - out.T @ products[rest, m:])
-    found = np.linalg.lstsq(left, right, rcond=None)[0].T
-    for target in {t for t, _ in given or {}}:
-        held = {k: value for (t, k), value in (given or {}).items() if t == target}
+    shared = np.linalg.lstsq(left, right, rcond=None)[0].T
+    for target in {t for t, _ in known or {}}:
+        held = {k: value for (t, k), value in (known or {}).items() if t == target}
         fixed, open_ = list(held), [k for k in range(len(some)) if k not in held]
         values = np.array(list(held.values()))
         rest = right[open_, target] - left[np.ix_(open_, fixed)] @ values
-        found[target, fixed] = values
-        found[target, open_] = np.linalg.lstsq(left[np.ix_(open_, open_)], rest, rcond=None)[0]
-    return found
+        shared[target, fixed] = values
+        shared[target, open_] = np.linalg.lstsq(left[np.ix_(open_, open_)], rest, rcond=None)[0]
+    return shared
