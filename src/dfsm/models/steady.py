@@ -15,7 +15,6 @@ from dfsm.core.types import Array, ComplexArray
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 
-
 # Damped least squares: steps have no part along which nothing changes, so that a state that nothing
 # depends on (an azimuth, say) stays put, and they do not run away as Newton's do.
 _SOLVER = optimistix.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
