@@ -43,10 +43,10 @@ def test_what_is_joined_is_split_again():
 
 def test_exogenous_values_are_those_without_states():
     assert ORDER.exogenous == ("u1", "u2", "w", "k", "m")
-    for found, expected in zip(
+    for values, expected in zip(
         ORDER.split_exogenous(jnp.array([4.0, 5, 6, 7, 8])), (U, W, P), strict=True
     ):
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(values, expected)
 
 
 @pytest.mark.parametrize("column", range(8))

@@ -109,28 +109,28 @@ def load_problem(
         The file is missing or not YAML, or a key or a signal is unknown, missing or wrong.
     """
     path = Path(path)
-    given = parse_file(path, ControlConfig, _ADVICE)
-    model = load(path.parent / given.model)
-    runs = _runs(given, path)
+    config = parse_file(path, ControlConfig, _ADVICE)
+    model = load(path.parent / config.model)
+    runs = _runs(config, path)
     try:
         method = DirectTranscription(
-            scheme=given.scheme,
-            mesh=_intervals(given.nodes),
-            refine=given.refine,
-            tolerance=given.tolerance,
-            most_iterations=given.most_iterations,
-            stay_inside=given.stay_inside,
+            scheme=config.scheme,
+            mesh=_intervals(config.nodes),
+            refine=config.refine,
+            tolerance=config.tolerance,
+            most_iterations=config.most_iterations,
+            stay_inside=config.stay_inside,
         )
         problem = OptimalControlProblem(
             model=model,
-            horizon=given.horizon,
-            cost=cost_of(given.cost, plant_of(model), given.units),
-            bounds=given.bounds,
-            rates=given.rates,
-            parameters=given.parameters,
-            initial=_initial(given, model, runs),
+            horizon=config.horizon,
+            cost=cost_of(config.cost, plant_of(model), config.units),
+            bounds=config.bounds,
+            rates=config.rates,
+            parameters=config.parameters,
+            initial=_initial(config, model, runs),
             disturbances=runs or None,
-            name=given.name or path.stem,
+            name=config.name or path.stem,
         )
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
@@ -184,16 +184,16 @@ _Factor = tuple[str, str, float]
 def _factors(term: CostTerm, where: str, plant: Plant) -> tuple[float, list[_Factor]]:
     forms = [f for f in ("value", "square", "product", "track") if getattr(term, f) is not None]
     if len(forms) != 1:
-        found = " and ".join(f"'{f}'" for f in forms) or "none"
-        raise DfsmError(f"'{where}' has {found}, expected one of value, square, product or track")
+        told = " and ".join(f"'{f}'" for f in forms) or "none"
+        raise DfsmError(f"'{where}' has {told}, expected one of value, square, product or track")
     form = forms[0]
     if (term.reference is None) == (form == "track"):
         wanted = "needs a key 'reference'" if form == "track" else "takes no key 'reference'"
         raise DfsmError(f"'{where}' {wanted}: the number that 'track' holds its signal at")
     if form == "product" and len(term.product or []) < 2:
         raise DfsmError(f"'{where}.product' names fewer than two signals: use value instead")
-    given = getattr(term, form)
-    names = list(given) if form == "product" else [given] * (1 if form == "value" else 2)
+    named = getattr(term, form)
+    names = list(named) if form == "product" else [named] * (1 if form == "value" else 2)
     reference = term.reference or 0.0
     return term.weight, [(_owner(plant, n, f"{where}.{form}"), n, reference) for n in names]
 
@@ -206,8 +206,8 @@ def _owner(plant: Plant, name: str, where: str) -> str:
     return letter
 
 
-def _runs(given: ControlConfig, path: Path) -> list[Trajectory]:
-    files = [given.disturbances] if isinstance(given.disturbances, str) else given.disturbances
+def _runs(config: ControlConfig, path: Path) -> list[Trajectory]:
+    files = [config.disturbances] if isinstance(config.disturbances, str) else config.disturbances
     return read_all(files, path.parent) if files else []
 
 
@@ -217,8 +217,8 @@ def _intervals(nodes: int) -> int:
     return nodes - 1
 
 
-def _initial(given: ControlConfig, model: DFSM, runs: Sequence[Trajectory]) -> dict[str, float]:
-    if given.initial == "free":
+def _initial(config: ControlConfig, model: DFSM, runs: Sequence[Trajectory]) -> dict[str, float]:
+    if config.initial == "free":
         return {}
     if len(runs) != 1:
         raise DfsmError(
@@ -226,8 +226,8 @@ def _initial(given: ControlConfig, model: DFSM, runs: Sequence[Trajectory]) -> d
             "one, or use free"
         )
     names = plant_of(model).names("states")
-    found = initial_state(model, runs[0], given.horizon[0])
-    return dict(zip(names, map(float, found), strict=True))
+    states = initial_state(model, runs[0], config.horizon[0])
+    return dict(zip(names, map(float, states), strict=True))
 
 
 def _guess(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> Trajectory | None:

@@ -132,7 +132,7 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
     ------
     DfsmError
         The file is missing or not YAML, a key is unknown or has a wrong type (its path is
-        given), or a pattern matches no file.
+        told), or a pattern matches no file.
     """
     path = Path(path)
     config = parse_config(path)
@@ -168,13 +168,15 @@ def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:
     raw = load_yaml(path, _ADVICE)
     try:
         _check_together(config)
-        found = {BASE: Candidate(config.fit_settings(), config.refine, f"{path.name} as it stands")}
+        candidates = {
+            BASE: Candidate(config.fit_settings(), config.refine, f"{path.name} as it stands")
+        }
         for name, changes in config.compare.candidates.items():
-            found[name] = _candidate(raw, name, changes)
-        check_candidates(found)
+            candidates[name] = _candidate(raw, name, changes)
+        check_candidates(candidates)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
-    return config, found
+    return config, candidates
 
 
 def _candidate(raw: Mapping[str, Any], name: str, changes: Mapping[str, Any]) -> Candidate:
@@ -213,16 +215,16 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
 
 
 def _changed(changes: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Path and value of every key that a candidate gives."""
-    found = []
+    """Path and value of every key that a candidate changes."""
+    pairs = []
     for key, value in changes.items():
         if isinstance(value, Mapping) and value:
-            found += _changed(value, f"{prefix}{key}.")
+            pairs += _changed(value, f"{prefix}{key}.")
         else:
             text = value if isinstance(value, str) else None
             shown = text or json.dumps(value, ensure_ascii=False, default=str)
-            found.append((f"{prefix}{key}", shown))
-    return found
+            pairs.append((f"{prefix}{key}", shown))
+    return pairs
 
 
 def _require_files(config: Config, path: Path) -> None:

@@ -86,14 +86,14 @@ def explain(
         return f"key '{where}' is missing"
     if first["type"].startswith("union_tag"):
         kinds = ", ".join(f"'{k}'" for k in _kinds(keys, kind))
-        given = first["input"].get("kind") if isinstance(first["input"], dict) else None
-        if given is None:
+        named = first["input"].get("kind") if isinstance(first["input"], dict) else None
+        if named is None:
             return f"'{where}' needs a key 'kind', one of {kinds}"
-        hint = near_matches(str(given), _kinds(keys, kind))
-        return f"'{where}.kind' is '{given}', expected one of {kinds}; {hint}"
-    found = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
+        hint = near_matches(str(named), _kinds(keys, kind))
+        return f"'{where}.kind' is '{named}', expected one of {kinds}; {hint}"
+    value = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
     message = _MESSAGES.get(first["type"], first["msg"])
-    return f"'{where}': {message[0].lower()}{message[1:]}{found}"
+    return f"'{where}': {message[0].lower()}{message[1:]}{value}"
 
 
 # Where pydantic speaks of Python, in the words of a configuration file.
@@ -134,7 +134,7 @@ def _known_keys(keys: list[int | str], raw: Any, kind: type[BaseModel]) -> list[
 
 def _kinds(keys: list[int | str], kind: type[BaseModel]) -> list[str]:
     """Values that the key 'kind' may have at a path."""
-    return [found for node in _schemas(keys, kind) if (found := _kind(node))]
+    return [name for node in _schemas(keys, kind) if (name := _kind(node))]
 
 
 def _kind(node: dict[str, Any]) -> str | None:

@@ -1,4 +1,4 @@
-"""The commented `config.yaml` that `dfsm init` writes, filled with the channels it found."""
+"""The commented `config.yaml` that `dfsm init` writes, filled with the channels of the runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ data:
   stop: null       # s
   hub_height: {hub_height}   # m; a number adds the channel RtVAvgxhCorr to every run
 
-# Channels found (unit, range over the first run{constant}):
+# Channels (unit, range over the first run{constant}):
 {channels}
 
 signals:
@@ -81,7 +81,7 @@ seed: 0
 
 
 def write_config(files: Sequence[str], path: Path) -> None:
-    """Write a configuration for the given runs.
+    """Write a configuration for some runs.
 
     Parameters
     ----------
@@ -194,8 +194,8 @@ def _flow(value: object) -> str:
 def _relative(files: Sequence[str], folder: Path) -> list[str]:
     """File names relative to the folder of the configuration, where they lie below it."""
     base = folder.resolve()
-    found = []
+    names = []
     for file in files:
         path = Path(file).resolve()
-        found.append(str(path.relative_to(base)) if path.is_relative_to(base) else str(path))
-    return found
+        names.append(str(path.relative_to(base)) if path.is_relative_to(base) else str(path))
+    return names

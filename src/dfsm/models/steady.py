@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from numpy.typing import ArrayLike
 
 from dfsm.core.types import Array, ComplexArray
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
+
+# Damped least squares: steps have no part along which nothing changes, so that a state that nothing
+# depends on (an azimuth, say) stays put, and they do not run away as Newton's do.
+_SOLVER = optimistix.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+_STEPS = 256
 
 
 @dataclass(frozen=True)
@@ -77,22 +84,13 @@ def steady_state(
     u = u if controls is None else jnp.asarray(controls, dtype=float)
     w = w if disturbances is None else jnp.asarray(disturbances, dtype=float)
     p = p if parameters is None else jnp.asarray(parameters, dtype=float)
-    scale = model.region.std[model.signals.state_columns]
-
-    def residual(z: jax.Array) -> jax.Array:
-        return model.derivative(x + scale * z, u, w, p) / scale
-
-    z, jacobian = jnp.zeros_like(x), jax.jit(jax.jacfwd(residual))
-    for _ in range(50):
-        r = residual(z)
-        # Minimum-norm step: a state that nothing depends on (an azimuth, say) stays put.
-        step = jnp.linalg.lstsq(jacobian(z), -r)[0]
-        norm = jnp.linalg.norm(step)
-        z = z + step * jnp.minimum(1.0, 2.0 / (norm + 1e-300))
-        if norm < 1e-12:
-            break
+    scale = model.region.scale[model.signals.state_columns]
+    held = _Held(model, x, scale, (u, w, p))
+    z = optimistix.least_squares(
+        _rates, _SOLVER, jnp.zeros_like(x), args=held, max_steps=_STEPS, throw=False
+    ).value
     states = x + scale * z
-    worst = float(jnp.max(jnp.abs(residual(z))))
+    worst = float(jnp.max(jnp.abs(_rates(z, held))))
     converged = bool(np.isfinite(worst) and worst < 1e-9)
     A = model.jacobians(states, u, w, p)[0]
     eigenvalues = np.linalg.eigvals(A).astype(np.complex128)
@@ -107,6 +105,21 @@ def steady_state(
         converged=converged,
         message=_message(model, converged, worst, eigenvalues, model.join(states, u, w, p)),
     )
+
+
+class _Held(NamedTuple):
+    """What stays while states are sought: the model, where they start, their size, the inputs."""
+
+    model: DFSM
+    start: jax.Array
+    scale: jax.Array
+    groups: tuple[jax.Array, jax.Array, jax.Array]
+
+
+def _rates(z: jax.Array, held: _Held) -> jax.Array:
+    """Derivatives in standard deviations per second, as many of them from the start."""
+    states = held.start + held.scale * z
+    return held.model.derivative(states, *held.groups) / held.scale
 
 
 def _operating_point(model: DFSM, schedule: float | None) -> jax.Array:

@@ -49,11 +49,11 @@ def evaluate(weights: jax.Array, z: jax.Array, sizes: Sizes) -> jax.Array:
 
 def layers(weights: jax.Array, sizes: Sizes) -> list[jax.Array]:
     """Matrices ``[W b]`` of the layers, shapes ``(out, in + 1)``."""
-    found, at = [], 0
+    matrices, at = [], 0
     for i, o in pairwise(sizes):
-        found.append(weights[at : at + o * (i + 1)].reshape(o, i + 1))
+        matrices.append(weights[at : at + o * (i + 1)].reshape(o, i + 1))
         at += o * (i + 1)
-    return found
+    return matrices
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ def _normal_equations(
 
     shapes = jax.eval_shape(sums, tuple(part[0] for part in samples))
     zero = jax.tree.map(lambda s: jnp.zeros(s.shape), shapes)
-    (found, Jtr), _ = jax.lax.scan(add, zero, samples)
-    blocks = {(k, m): _unfolded(s, sizes, k, m) for (k, m), s in zip(pairs, found, strict=True)}
+    (products, Jtr), _ = jax.lax.scan(add, zero, samples)
+    blocks = {(k, m): _unfolded(s, sizes, k, m) for (k, m), s in zip(pairs, products, strict=True)}
     order = range(len(matrices))
     JtJ = jnp.block([[blocks[k, m] if k <= m else blocks[m, k].T for m in order] for k in order])
     return JtJ, Jtr
