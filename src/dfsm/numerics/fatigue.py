@@ -5,13 +5,13 @@ from __future__ import annotations
 import fatpack
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.shapes import Series
 
 WOHLER_EXPONENTS = (3.0, 4.0, 5.0, 10.0)
 
 
 def damage_equivalent_load(
-    values: Array, duration: float, exponent: float, frequency: float = 1.0
+    values: Series, duration: float, exponent: float, frequency: float = 1.0
 ) -> float:
     """Amplitude range of a constant-amplitude load that does the same damage.
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.signal import butter, sosfiltfilt
 
 from dfsm.core.settings import settings_class
+from dfsm.core.shapes import Series
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.smoothing import checked
@@ -57,7 +58,7 @@ class Filter:
             raise DfsmError(f"a {self.kind} filter came with {wanted}={value}: give a positive one")
 
 
-def moving_average(time: ArrayLike, values: ArrayLike, window: float) -> Array:
+def moving_average(time: ArrayLike, values: ArrayLike, window: float) -> Series:
     """Average over a time window centred on each sample, on any mesh.
 
     The signal is taken as linear between samples. Near the ends the window shrinks on both
@@ -103,7 +104,7 @@ def moving_average(time: ArrayLike, values: ArrayLike, window: float) -> Array:
     return average + centre
 
 
-def low_pass(time: ArrayLike, values: ArrayLike, cutoff: float) -> Array:
+def low_pass(time: ArrayLike, values: ArrayLike, cutoff: float) -> Series:
     """Butterworth low-pass of order 4, run forward and backward, hence without phase.
 
     Parameters
@@ -143,7 +144,7 @@ def low_pass(time: ArrayLike, values: ArrayLike, cutoff: float) -> Array:
     return sosfiltfilt(sections, y, padlen=padding)
 
 
-def filtered(time: Array, values: Array, chosen: Filter | None) -> Array:
+def filtered(time: Series, values: Series, chosen: Filter | None) -> Series:
     """Apply a filter, or none.
 
     Parameters

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dfsm.core.types import Array, IntArray
+from dfsm.core.shapes import Labels, Means, Points, Rows, Samples, Targets
 from dfsm.errors import DfsmError
 
 Method = Literal["kmeans", "maxmin", "random"]
@@ -34,10 +34,10 @@ class Subsample:
         The point that each sample belongs to (its nearest), shape ``(sample,)``.
     """
 
-    points: Array
-    labels: IntArray
+    points: Points
+    labels: Labels
 
-    def means(self, values: Array) -> Array:
+    def means(self, values: Targets) -> Means:
         """Average the values of the samples of each point.
 
         Parameters
@@ -56,7 +56,7 @@ class Subsample:
         return np.stack(sums, axis=1) / counts[:, None]
 
 
-def subsample(inputs: Array, size: int, method: Method = "kmeans", seed: int = 0) -> Subsample:
+def subsample(inputs: Samples, size: int, method: Method = "kmeans", seed: int = 0) -> Subsample:
     """Choose `size` points that represent the samples.
 
     Parameters
@@ -103,7 +103,7 @@ def subsample(inputs: Array, size: int, method: Method = "kmeans", seed: int = 0
     return result
 
 
-def nearest(inputs: Array, points: Array) -> IntArray:
+def nearest(inputs: Samples, points: Points) -> Labels:
     """Index of the nearest point for every sample, by Euclidean distance."""
     from scipy.spatial import KDTree
 
@@ -111,7 +111,7 @@ def nearest(inputs: Array, points: Array) -> IntArray:
     return np.asarray(index, dtype=np.int64)
 
 
-def _kmeans(inputs: Array, size: int, rng: np.random.Generator) -> Array:
+def _kmeans(inputs: Samples, size: int, rng: np.random.Generator) -> Points:
     from sklearn.cluster import KMeans
     from sklearn.exceptions import ConvergenceWarning
 
@@ -128,7 +128,7 @@ def _kmeans(inputs: Array, size: int, rng: np.random.Generator) -> Array:
         return model.fit(inputs).cluster_centers_
 
 
-def maxmin(inputs: Array, size: int, rng: np.random.Generator) -> IntArray:
+def maxmin(inputs: Samples, size: int, rng: np.random.Generator) -> Rows:
     """Indices of samples each as far as possible from those before it (Johnson et al. 1990).
 
     Parameters

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from dfsm.core.shapes import Series
 from dfsm.core.types import Array, IntArray
 from dfsm.errors import DfsmError
 
@@ -56,9 +57,9 @@ class SmoothResult:
         What set λ. Data without visible noise is interpolated.
     """
 
-    values: Array
-    first: Array
-    second: Array
+    values: Series
+    first: Series
+    second: Series
     noise_std: float
     smoothing: float
     degrees_of_freedom: float
@@ -127,7 +128,7 @@ def smoothing_spline(time: ArrayLike, values: ArrayLike, step: float | None = No
     )
 
 
-def cubic_spline(time: ArrayLike, values: ArrayLike) -> tuple[Array, Array, Array]:
+def cubic_spline(time: ArrayLike, values: ArrayLike) -> tuple[Series, Series, Series]:
     """Interpolate and differentiate as the paper does: SciPy's `CubicSpline`, not-a-knot.
 
     Parameters
@@ -152,7 +153,7 @@ def cubic_spline(time: ArrayLike, values: ArrayLike) -> tuple[Array, Array, Arra
     return y, spline(t, 1), spline(t, 2)
 
 
-def interpolate(time: Array, values: Array) -> tuple[Array, Array, Array]:
+def interpolate(time: Series, values: Series) -> tuple[Series, Series, Series]:
     """Values, first and second derivative of the not-a-knot quintic spline through the samples.
 
     Parameters
@@ -171,7 +172,7 @@ def interpolate(time: Array, values: Array) -> tuple[Array, Array, Array]:
     return values, spline(x, 1) / h, spline(x, 2) / h**2
 
 
-def checked(time: ArrayLike, values: ArrayLike) -> tuple[Array, Array]:
+def checked(time: ArrayLike, values: ArrayLike) -> tuple[Series, Series]:
     """Return time and values as arrays that a spline can take.
 
     Raises

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from scipy.signal import welch
 
-from dfsm.core.types import Array
+from dfsm.core.shapes import Bins, Series
 from dfsm.errors import DfsmError
 from dfsm.numerics.time_mesh import time_step
 
@@ -35,8 +35,8 @@ class Spectrum:
         In the signal's unit squared per Hz, shape ``(bin,)``.
     """
 
-    frequency: Array
-    density: Array
+    frequency: Bins
+    density: Bins
 
     def peak(self, band: Band) -> float | None:
         """Frequency of the largest density in a band, in Hz; None if it holds no bin."""
@@ -54,7 +54,7 @@ class Spectrum:
         return (self.frequency >= band.low) & (self.frequency <= band.high)
 
 
-def spectrum(time: Array, values: Array, segment: float = 200.0) -> Spectrum:
+def spectrum(time: Series, values: Series, segment: float = 200.0) -> Spectrum:
     """Welch's estimate: Hann windows of `segment` seconds, half overlapping, mean removed.
 
     Parameters

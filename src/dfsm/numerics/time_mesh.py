@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.shapes import Series
 
 # Share of a step by which times may miss a straight line: of no weight for filters and spectra.
 _SHARE = 1e-3
@@ -13,7 +13,7 @@ _COARSE = 0.1
 _MOST_DECIMALS = 8
 
 
-def time_step(time: Array) -> float | None:
+def time_step(time: Series) -> float | None:
     """Sampling interval of an equidistant mesh; the one definition of equidistant.
 
     All times lie on the straight line from the first to the last, within a thousandth of a step or
@@ -42,7 +42,7 @@ def time_step(time: Array) -> float | None:
     return step if error <= _rounding(time, step) + slack else None
 
 
-def _rounding(time: Array, step: float) -> float:
+def _rounding(time: Series, step: float) -> float:
     """Unit in s to which the times of an equidistant mesh seem to be rounded; 0 for none."""
     largest, most = np.abs(time).max(), _COARSE * step
     single = float(np.spacing(np.float32(largest)))

@@ -17,6 +17,7 @@ import numpy as np
 from dfsm.core.types import Array, IntArray
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import poles
+from dfsm.numerics.runge_kutta import rk4_step
 from dfsm.refinement.parameters import Parametrization
 from dfsm.simulation.integrate import clip_range, exogenous_groups, rate
 
@@ -198,35 +199,25 @@ def _path(
     M = jnp.stack([-dynamics.decay, dynamics.frequency, -dynamics.frequency, -dynamics.decay])
     M = M.T.reshape(-1, 2, 2)
 
-    def slope(at: _At, v: jax.Array) -> tuple[_At, jax.Array]:
-        x, P = at
-        inputs = model.join(x, *exogenous_groups(model, v))
-        grown = M @ P + parameters.latent_slopes(plain, inputs) if P.size else P
-        return (rate(model, x, v), grown), inputs
+    def inputs(x: jax.Array, v: jax.Array) -> jax.Array:
+        return model.join(x, *exogenous_groups(model, v))
 
-    def advance(at: _At, drive: tuple[jax.Array, ...]) -> tuple[_At, _Path]:
-        v0, vm, v1 = drive
-        stages = [at]
-        k1, i1 = slope(stages[0], v0)
-        stages.append(_moved(at, k1, step / 2))
-        k2, i2 = slope(stages[1], vm)
-        stages.append(_moved(at, k2, step / 2))
-        k3, i3 = slope(stages[2], vm)
-        stages.append(_moved(at, k3, step))
-        k4, i4 = slope(stages[3], v1)
-        total = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-        x, P = _moved(at, total, step)
+    def slope(at: _At, v: jax.Array) -> _At:
+        x, P = at
+        grown = M @ P + parameters.latent_slopes(plain, inputs(x, v)) if P.size else P
+        return rate(model, x, v), grown
+
+    def advance(at: _At, drive: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[_At, _Path]:
+        (x, P), stages = rk4_step(slope, at, step, drive)
         held = jnp.clip(x, low, high)
         free = jnp.where(held == x, 1.0, 0.0)
         P = P * free[observed:].reshape(-1, 2)[..., None]
-        pairs = jnp.stack([s[1] for s in stages])
-        return (held, P), _Path(held, free, jnp.stack([i1, i2, i3, i4]), pairs)
+        v0, vm, v1 = drive
+        seen = [inputs(x, v) for (x, _), v in zip(stages, (v0, vm, vm, v1), strict=True)]
+        pairs = jnp.stack([pair for _, pair in stages])
+        return (held, P), _Path(held, free, jnp.stack(seen), pairs)
 
     return jax.lax.scan(advance, (x0, pairs0), (v[:-2:2], v[1::2], v[2::2]))[1]
-
-
-def _moved(at: _At, k: _At, dt: float) -> _At:
-    return at[0] + dt * k[0], at[1] + dt * k[1]
 
 
 def _state_matrix(model: DFSM, inputs: jax.Array) -> jax.Array:

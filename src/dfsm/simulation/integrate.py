@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
+from dfsm.numerics.runge_kutta import rk4_step
 
 # Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 1000
@@ -73,6 +75,8 @@ class Pieces:
 
 
 Drive = TypeVar("Drive", Mesh, Pieces)
+# Length of a step, and exogenous inputs at its start, middle and end.
+_Drive = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
@@ -266,13 +270,8 @@ def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = n
     """
     low, high = clip_range(model, bound)
 
-    def step(x: jax.Array, drive: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        dt, v0, vm, v1 = drive
-        k1 = rate(model, x, v0)
-        k2 = rate(model, x + 0.5 * dt * k1, vm)
-        k3 = rate(model, x + 0.5 * dt * k2, vm)
-        k4 = rate(model, x + dt * k3, v1)
-        x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    def step(x: jax.Array, drive: _Drive) -> tuple[jax.Array, jax.Array]:
+        x, _ = rk4_step(partial(rate, model), x, drive[0], drive[1:])
         if np.isfinite(bound):
             x = jnp.clip(x, low, high)
         return x, x

@@ -322,8 +322,8 @@ def _segment(
         base = jnp.where(last, total, base)
         return (base, k, total), base
 
-    # One loop over the four stages of all steps: the code of a step, with its derivatives, is
-    # compiled once and not four times.
+    # One loop over the four stages of all steps, where `rk4_step` has them one after another: the
+    # plant with its second derivatives is compiled once and not four times.
     count = pieces * steps
     middle = 2 * jnp.repeat(jnp.arange(count), 4) + jnp.tile(jnp.array([0, 1, 1, 2]), count)
     a, b = jnp.array([0, 0.5, 0.5, 1]), jnp.array([1, 2, 2, 1]) / 6
