@@ -204,7 +204,7 @@ def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
     turn = adaptive_robot.AdaptiveRobotSettings(
         runs=4,
         corrective=dfsm.GP(samples=40),
-        settings=dfsm.AdaptiveSettings(most_rounds=1, method=adaptive_robot.METHOD),
+        options=dfsm.AdaptiveSettings(most_rounds=1, method=adaptive_robot.METHOD),
     )
     monkeypatch.setattr(codesign, "CodesignSettings", lambda: arm)
     monkeypatch.setattr(adaptive_robot, "AdaptiveRobotSettings", lambda: turn)
