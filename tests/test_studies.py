@@ -71,7 +71,7 @@ def test_rows_of_angles_are_linear_and_get_no_correction(quick):
 
 
 def test_a_correction_helps_and_leaves_linear_rows_alone(quick):
-    found = quick.multi_fidelity.found
+    found = quick.multi_fidelity.assessed
     linear, multi, nonlinear = (found[n] for n in (LINEAR, MULTI, NONLINEAR))
     assert (multi.slopes[:2] < 0.9 * linear.slopes[:2]).all()
     assert (multi.slopes[2:] < 1e-6).all()
@@ -84,7 +84,8 @@ def test_the_documentation_states_the_sweep(quick):
     block = text.split("<!-- sweep -->")[1].split("<!-- end -->")[0]
     stated = {row.split(" | ")[0].strip("| "): row.split(" | ")[4:] for row in block.splitlines()}
     sweep = quick.multi_fidelity.sweep
-    for n, a, b in zip(sweep.samples, sweep.found[MULTI], sweep.found[NONLINEAR], strict=True):
+    pairs = zip(sweep.assessed[MULTI], sweep.assessed[NONLINEAR], strict=True)
+    for n, (a, b) in zip(sweep.samples, pairs, strict=True):
         errors = np.stack([a.rollouts.rmse, b.rollouts.rmse], axis=1).ravel()
         assert [float(c.strip(" |")) for c in stated[str(n)]] == pytest.approx(errors, rel=0.05)
 

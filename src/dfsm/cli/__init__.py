@@ -54,11 +54,11 @@ def info(files: Files, as_json: AsJson = False) -> None:
     from dfsm.data.readers import read_all
 
     with show_progress():
-        found = [describe(run) for run in read_all(files)]
+        infos = [describe(run) for run in read_all(files)]
     if as_json:
-        print_json([f.to_dict() for f in found])
+        print_json([i.to_dict() for i in infos])
     else:
-        print_info(found)
+        print_info(infos)
 
 
 @app.command()
@@ -70,7 +70,7 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a commented configuration with the channels found in the files."""
+    """Write a commented configuration with the channels of the files."""
     from dfsm.config.template import write_config
     from dfsm.core.files import check_file
 
@@ -139,16 +139,16 @@ def compare(
     with working(quiet):
         runs = read_all(settings.data.train, config.parent)
         validation = None if files is None else read_all(files, config.parent)
-        found = run_compare(
+        ranking = run_compare(
             candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
         )
-    if found.best is None:
-        raise DfsmError("; ".join(found.failures()))
+    if ranking.best is None:
+        raise DfsmError("; ".join(ranking.failures()))
     if as_json:
-        print_json(found.to_dict())
+        print_json(ranking.to_dict())
     elif not quiet:
-        print_ranking(found)
-    if found.best.score is None:
+        print_ranking(ranking)
+    if ranking.best.score is None:
         raise typer.Exit(1)
 
 
@@ -199,7 +199,7 @@ def validate(
     models = load_all(model)
     main = next(iter(models.values()))
     start = fit_start(main) if start is None else start
-    given = None if intervals is None else load_intervals(intervals)
+    calibrated = None if intervals is None else load_intervals(intervals)
     with working(quiet):
         runs = read_all(files)
         for path in targets:
@@ -207,16 +207,18 @@ def validate(
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
-        found = run_validate(candidates, runs, start=start, stop=stop, intervals=given)
+        validation = run_validate(candidates, runs, start=start, stop=stop, intervals=calibrated)
         if output is not None:
-            write_report({model.name or str(model): found}, output)
+            write_report({model.name or str(model): validation}, output)
     if metrics is not None:
-        write_json(metrics, found.to_dict())
+        write_json(metrics, validation.to_dict())
     if not quiet:
-        print_validation(found)
+        print_validation(validation)
     for path in targets:
         say(f"wrote {path}", quiet)
-    _exit_if_ended([r.models[m].simulation for r in found.runs for m in ("multi-fidelity",)], quiet)
+    _exit_if_ended(
+        [r.models[m].simulation for r in validation.runs for m in ("multi-fidelity",)], quiet
+    )
 
 
 @app.command()
@@ -250,9 +252,9 @@ def simulate(
     check_file(output, [path for path in (run, intervals) if path and Path(path).exists()])
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
-    given = None if intervals is None else load_intervals(intervals)
-    if given is not None:
-        given.check(surrogate)
+    calibrated = None if intervals is None else load_intervals(intervals)
+    if calibrated is not None:
+        calibrated.check(surrogate)
     with working(quiet), hushed():  # the outcome is printed below
         signals = surrogate.signals
         recorded = with_computed(read(run), signals.hub_height, signals.features)
@@ -263,7 +265,9 @@ def simulate(
             stop=stop,
             settings=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
         )
-    write_table(result.trajectory if given is None else given.beside(result, recorded), output)
+    write_table(
+        result.trajectory if calibrated is None else calibrated.beside(result, recorded), output
+    )
     if as_json:
         print_json(
             {

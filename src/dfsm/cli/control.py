@@ -35,8 +35,12 @@ def export_rosco(
         load_solution(result), output, pitch=pitch, torque=torque, scenario=scenario, step=step
     )
     if as_json:
-        given = {"pitch": written.pitch, "torque": written.torque, "discon": dict(written.discon)}
-        print_json({"output": str(output), "rows": written.rows, **given, "Ptch_Cntrl": 1})
+        settings = {
+            "pitch": written.pitch,
+            "torque": written.torque,
+            "discon": dict(written.discon),
+        }
+        print_json({"output": str(output), "rows": written.rows, **settings, "Ptch_Cntrl": 1})
         return
     say(lines(f"wrote {output} ({written.rows} rows); to use it, set"), quiet)
     for line in written.lines():
@@ -55,8 +59,8 @@ def check_run(
     from dfsm.control import load_solution
     from dfsm.data.readers import read
 
-    found = compare(load_solution(result), read(run), scenario)
+    comparison = compare(load_solution(result), read(run), scenario)
     if as_json:
-        print_json(found.to_dict())
+        print_json(comparison.to_dict())
     else:
-        print_check(found)
+        print_check(comparison)

@@ -34,8 +34,8 @@ def calibrate(
     with working(quiet):
         runs = read_all(files)
         check_file(output, [*model.iterdir(), *(run.source for run in runs)])
-        found = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
-    found.save(output)
+        intervals = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
+    intervals.save(output)
     if not quiet:
-        print_intervals(found)
+        print_intervals(intervals)
     say(f"wrote {output}: give it to dfsm simulate or validate as --intervals {output}", quiet)

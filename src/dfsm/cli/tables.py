@@ -24,7 +24,7 @@ _LONG = 45
 
 
 def print_info(runs: Sequence[RunInfo]) -> None:
-    """Print what `dfsm info` found, one table per run."""
+    """Print what `dfsm info` says, one table per run."""
     console = _console()
     for run in runs:
         sampling = (
@@ -44,26 +44,28 @@ def print_info(runs: Sequence[RunInfo]) -> None:
             console.print(_text(f"warning: {text}"))
 
 
-def print_validation(found: Validation) -> None:
+def print_validation(validation: Validation) -> None:
     """Print the mean NRMSE of every channel and variant, and what each variant cost."""
-    print_validations({"": found})
+    print_validations({"": validation})
 
 
-def print_validations(found: Mapping[str, Validation]) -> None:
+def print_validations(validations: Mapping[str, Validation]) -> None:
     """Print one table over several fitted models: errors, times, speed-ups.
 
     Parameters
     ----------
-    found
+    validations
         Validation per fitted model.
     """
     console = _console()
-    variants = list(dict.fromkeys(v for validation in found.values() for v in validation.models))
-    several = len(found) > 1
-    inside = any(v.intervals is not None for v in found.values())
+    variants = list(
+        dict.fromkeys(v for validation in validations.values() for v in validation.models)
+    )
+    several = len(validations) > 1
+    inside = any(v.intervals is not None for v in validations.values())
     heads = ["model"] * several + ["channel", "unit", *variants, "RMSE*", "max*"]
     table = _table(*heads, *["inside*", "promised"] * inside)
-    for label, validation in found.items():
+    for label, validation in validations.items():
         for i, c in enumerate(validation.channels):
             row: list[str | Text] = [_text(label if i == 0 else "")] if several else []
             row += [_text(c.name), _text(c.unit)]
@@ -77,7 +79,7 @@ def print_validations(found: Mapping[str, Validation]) -> None:
             if inside:
                 row += _inside(validation, c.name)
             table.add_row(*row, end_section=i == len(validation.channels) - 1)
-    for label, validation in found.items():
+    for label, validation in validations.items():
         prefix = f"{label}: " if several else ""
         for text in validation.warnings:
             console.print(_text(f"{prefix}{text}"))
@@ -93,7 +95,7 @@ def print_validations(found: Mapping[str, Validation]) -> None:
     times = _table(
         *(["model"] if several else []), "variant", "rollouts done", "wall time", "speed-up"
     )
-    for label, validation in found.items():
+    for label, validation in validations.items():
         for i, variant in enumerate(validation.models):
             speed = validation.speed_up(variant)
             row = [_text(label if i == 0 else "")] if several else []
@@ -105,67 +107,72 @@ def print_validations(found: Mapping[str, Validation]) -> None:
             ]
             times.add_row(*row)
     console.print(times)
-    for label, validation in found.items():
+    for label, validation in validations.items():
         prefix = f"{label}: " if several else ""
         for text in (*validation.endings(), *validation.outside()):
             console.print(_text(f"{prefix}{text}"))
 
 
-def print_intervals(found: Intervals) -> None:
+def print_intervals(intervals: Intervals) -> None:
     """Print the half-widths of prediction intervals, from the smallest to the largest."""
     console = _console()
-    for text in found.warnings:
+    for text in intervals.warnings:
         console.print(_text(text))
-    along = "" if found.schedule is None else f" along {found.schedule}"
-    promised = f"a new run is expected inside {100 * found.level:g} % of the time"
+    along = "" if intervals.schedule is None else f" along {intervals.schedule}"
+    promised = f"a new run is expected inside {100 * intervals.level:g} % of the time"
     console.print(_text(f"half-widths of prediction intervals{along}; {promised}"))
     table = _table("channel", "smallest", "largest", "unit")
-    for name, unit, half in zip(found.channels, found.units, found.half_width.T, strict=True):
+    for name, unit, half in zip(
+        intervals.channels, intervals.units, intervals.half_width.T, strict=True
+    ):
         table.add_row(_text(name), f"{half.min():.4g}", f"{half.max():.4g}", _text(unit))
     console.print(table)
 
 
-def print_ranking(found: Ranking) -> None:
+def print_ranking(ranking: Ranking) -> None:
     """Print candidates best first, what each changes, and how to use the best."""
     console = _console()
-    table = _table("candidate", "score", *map(printable, found.states), "rollouts done")
+    table = _table("candidate", "score", *map(printable, ranking.states), "rollouts done")
     for column in ("parameters", "fit", "simulate"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("changes", justify="left", overflow="fold")
-    of = len(found.validation)
-    for c in found.candidates:
+    of = len(ranking.validation)
+    for c in ranking.candidates:
         o = c.outcome
-        figures = [_figure(c.score, ".3f"), *(_figure(o.nrmse.get(n), ".3f") for n in found.states)]
+        figures = [
+            _figure(c.score, ".3f"),
+            *(_figure(o.nrmse.get(n), ".3f") for n in ranking.states),
+        ]
         costs = [f"{of - o.diverged} of {of}", str(o.parameters)]
         costs += [f"{o.fit_seconds:.1f} s", f"{1000 * o.simulate_seconds:.0f} ms"]
         costs = ["–"] * len(costs) if c.status == "failed" else costs
         table.add_row(_text(c.name), *figures, *costs, _text(c.changes))
     console.print(table)
-    states = ", ".join(found.states)
+    states = ", ".join(ranking.states)
     console.print(_text(f"score: root mean square over {states} of the NRMSE of rollouts"))
-    for text in found.failures():
+    for text in ranking.failures():
         console.print(_text(text))
-    kept = [c.name for c in found.candidates if c.kept]
+    kept = [c.name for c in ranking.candidates if c.kept]
     if kept:
         console.print(_text(f"not fitted again, nothing has changed: {', '.join(kept)}"))
-    console.print(_text(f"trained on: {', '.join(found.training)}"))
-    console.print(_text(f"chosen on: {', '.join(found.validation)} (test the choice on others)"))
-    if found.best is not None:
-        use = f"its model is {found.best.folder}: dfsm validate it on other runs"
-        console.print(_text(f"best: {found.best.name}, {use}"))
+    console.print(_text(f"trained on: {', '.join(ranking.training)}"))
+    console.print(_text(f"chosen on: {', '.join(ranking.validation)} (test the choice on others)"))
+    if ranking.best is not None:
+        use = f"its model is {ranking.best.folder}: dfsm validate it on other runs"
+        console.print(_text(f"best: {ranking.best.name}, {use}"))
 
 
-def print_check(found: RunCheck) -> None:
+def print_check(check: RunCheck) -> None:
     """Print how a high-fidelity run under optimal controls differs from the prediction."""
     console = _console()
-    part = "the whole horizon" if found.complete else "a part of the horizon"
-    span = f"{found.start:g} to {found.stop:g} s, {part}"
-    console.print(_text(f"{found.run} against {found.name}, {span}; figures: predicted → actual"))
-    if found.power is not None:
-        ahead, came = found.power["predicted"], found.power["actual"]
-        console.print(_text(f"mean power ({found.power_source}): {ahead:.5g} → {came:.5g} kW"))
+    part = "the whole horizon" if check.complete else "a part of the horizon"
+    span = f"{check.start:g} to {check.stop:g} s, {part}"
+    console.print(_text(f"{check.run} against {check.name}, {span}; figures: predicted → actual"))
+    if check.power is not None:
+        ahead, came = check.power["predicted"], check.power["actual"]
+        console.print(_text(f"mean power ({check.power_source}): {ahead:.5g} → {came:.5g} kW"))
     table = _table("channel", "unit", "mean", "max", "DEL m=4", "DEL m=10", "RMSE", "NRMSE")
-    for name, c in found.channels.items():
+    for name, c in check.channels.items():
         a, b = c.predicted, c.actual
         pairs = [(a.mean, b.mean), (a.maximum, b.maximum)]
         pairs += [(a.damage.get(m), b.damage.get(m)) for m in ("4", "10")]
@@ -174,17 +181,17 @@ def print_check(found: RunCheck) -> None:
         ]
         table.add_row(_text(name), _text(c.unit), *cells, f"{c.rmse:.3g}", f"{c.nrmse:.3f}")
     console.print(table)
-    if found.limits:
+    if check.limits:
         table = _table("channel", "beyond its limits by", "at", "share of samples")
-        for name, limit in found.limits.items():
+        for name, limit in check.limits.items():
             at = "" if limit.at is None else f"{limit.at:g} s"
             beyond = f"{limit.predicted:.3g} → {limit.actual:.3g}"
             table.add_row(_text(name), beyond, at, f"{limit.share:.1%}")
         console.print(table)
     else:
         console.print("no bounds of these channels are saved with the solution")
-    if found.missing:
-        console.print(_text(f"not in the run: {', '.join(found.missing)}"))
+    if check.missing:
+        console.print(_text(f"not in the run: {', '.join(check.missing)}"))
 
 
 def print_article(article: Article) -> None:
@@ -192,18 +199,18 @@ def print_article(article: Article) -> None:
     console = _console()
     for section in article.sections:
         console.print(Text(section.heading, style="bold underline"))
-        for given in section.tables:
-            console.print(Text(f"\n{given.caption}", style="italic"))
-            table = _table(*given.columns)
+        for part in section.tables:
+            console.print(Text(f"\n{part.caption}", style="italic"))
+            table = _table(*part.columns)
             for column, made in enumerate(table.columns):
-                made.justify = "left" if given.is_text(column) else "right"
+                made.justify = "left" if part.is_text(column) else "right"
                 # Sentences may break, numbers and names may not.
-                made.no_wrap = max(len(row[column]) for row in given.texts()) < _LONG
-            for row in given.texts():
+                made.no_wrap = max(len(row[column]) for row in part.texts()) < _LONG
+            for row in part.texts():
                 table.add_row(*map(_text, row))
             console.print(table)
-            if given.note:
-                console.print(_text(given.note), style="dim")
+            if part.note:
+                console.print(_text(part.note), style="dim")
         console.print()
 
 

@@ -38,7 +38,7 @@ def lines(text: str) -> str:
 
 
 def say(message: str, quiet: bool) -> None:
-    """Print one line, unless --quiet was given."""
+    """Print one line, unless --quiet says not to."""
     if not quiet:
         typer.echo(message)
 

@@ -1,4 +1,4 @@
-"""Array types of signatures; shapes are given in the docstrings."""
+"""Array types of signatures; shapes are in the docstrings."""
 
 import numpy as np
 from numpy.typing import NDArray

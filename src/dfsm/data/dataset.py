@@ -17,7 +17,7 @@ _SAME = 0.01
 
 
 class Dataset(Sequence[Trajectory]):
-    """Runs in an order given by their content, so that the order of files never matters.
+    """Runs in an order that their content decides, so that the order of files never matters.
 
     Meshes and lengths may differ from run to run. The runs share at least one channel.
 

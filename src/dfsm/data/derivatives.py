@@ -48,7 +48,7 @@ class StateSpec:
     order
         1: q is a state, q̇ its derivative. 2: q and q̇ are states, with derivatives q̇ and q̈.
     rate, acceleration
-        Channels that hold q̇ and q̈ as the simulator computed them; where given they are used
+        Channels that hold q̇ and q̈ as the simulator computed them; where named they are used
         instead of differentiating (`acceleration` only with ``order=2``). The units must be the
         state's unit per s and per s².
 
@@ -136,7 +136,7 @@ def state_names(states: Sequence[StateSpec]) -> tuple[str, ...]:
     Raises
     ------
     DfsmError
-        No state, a state given twice, or one that bears the name of another's rate.
+        No state, a state that occurs twice, or one that bears the name of another's rate.
     """
     names = (*(s.name for s in states), *(f"{s.name}_dot" for s in states if s.order == 2))
     if not names:
@@ -202,12 +202,12 @@ def differentiate(
     settings = settings or DerivativeSettings()
     names = state_names(states)
     _check_names(trajectory, states, settings)
-    found = [_differentiate_state(trajectory, s, settings) for s in states]
+    extracted = [_differentiate_state(trajectory, s, settings) for s in states]
     second = [i for i, s in enumerate(states) if s.order == 2]
 
     values = trajectory.values.copy()
     channels = list(trajectory.channels)
-    for spec, state in zip(states, found, strict=True):
+    for spec, state in zip(states, extracted, strict=True):
         column = trajectory.column(spec.name)
         values[:, column] = state.q
         channels[column] = replace(channels[column], step=None)
@@ -219,8 +219,10 @@ def differentiate(
         )
     ]
     if second:
-        smoothed = smoothed.with_channels(rates, np.stack([found[i].rate for i in second], axis=1))
-    derivatives = [*(f.rate for f in found), *(found[i].acceleration for i in second)]
+        smoothed = smoothed.with_channels(
+            rates, np.stack([extracted[i].rate for i in second], axis=1)
+        )
+    derivatives = [*(f.rate for f in extracted), *(extracted[i].acceleration for i in second)]
     return Differentiated(
         trajectory=smoothed,
         names=names,
@@ -230,7 +232,7 @@ def differentiate(
             *(f"{states[i].name}_ddot" for i in second),
         ),
         derivative_units=tuple(per_second(u) for u in state_units(states, trajectory)),
-        noise_std=(*(f.noise_std for f in found), *(None for _ in second)),
+        noise_std=(*(f.noise_std for f in extracted), *(None for _ in second)),
     )
 
 
@@ -311,13 +313,13 @@ def _check_names(
 
 def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None:
     """Compare units; one that a file does not state cannot be compared and passes."""
-    unit, given = run.channel(spec.name).unit, run.channel(name).unit
+    unit, its = run.channel(spec.name).unit, run.channel(name).unit
     wanted = unit
     for _ in range(times):
         wanted = per_second(wanted)
-    if unit and given and _time_power(given) != _time_power(wanted):
+    if unit and its and _time_power(its) != _time_power(wanted):
         raise DfsmError(
-            f"{run.where}: channel '{name}' in '{given}' is not the "
+            f"{run.where}: channel '{name}' in '{its}' is not the "
             f"{('first', 'second')[times - 1]} derivative of '{spec.name}' in '{unit}': a channel "
             f"in '{wanted}' is expected, name another or leave it out"
         )

@@ -43,9 +43,9 @@ class Feature:
 
     def __post_init__(self) -> None:
         if self.kind == "lag":
-            given = self.time_constant
-            positive = given is not None and bool(np.isfinite(given)) and given > 0
-            require(positive, "features.time_constant", given, "a positive number of seconds")
+            seconds = self.time_constant
+            positive = seconds is not None and bool(np.isfinite(seconds)) and seconds > 0
+            require(positive, "features.time_constant", seconds, "a positive number of seconds")
         else:
             require(
                 self.time_constant is None,

@@ -158,27 +158,27 @@ def gap_warning(trajectory: Trajectory) -> str | None:
 
 
 def _warnings(trajectory: Trajectory) -> list[str]:
-    found = []
+    sentences = []
     if gap := gap_warning(trajectory):
-        found.append(gap)
+        sentences.append(gap)
     seen: dict[bytes, str] = {}
     for name, values in zip(trajectory.names, trajectory.values.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
-            found.append(
+            sentences.append(
                 f"'{name}' has {len(bad)} NaN or infinite samples, the first at "
                 f"{trajectory.time[bad[0]]:g} s"
             )
         elif values.min() == values.max():
             # Two constants often agree by chance: that they are constant says enough.
-            found.append(f"'{name}' is constant ({values[0]:g})")
+            sentences.append(f"'{name}' is constant ({values[0]:g})")
             continue
         data = values.tobytes()
         if data in seen:
-            found.append(f"'{name}' holds the same data as '{seen[data]}'")
+            sentences.append(f"'{name}' holds the same data as '{seen[data]}'")
         else:
             seen[data] = name
-    return [*found, *trajectory.notes]
+    return [*sentences, *trajectory.notes]
 
 
 def _without_nan(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -210,7 +210,7 @@ class Trajectory:
     # -- new trajectories from old --------------------------------------------------------------
 
     def select(self, names: Iterable[str]) -> Trajectory:
-        """Keep the named channels, in the order given."""
+        """Keep the named channels, in this order."""
         columns = self.columns(names)
         return replace(
             self,

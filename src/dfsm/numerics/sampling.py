@@ -29,7 +29,7 @@ class Subsample:
     Attributes
     ----------
     points
-        Representative inputs, shape ``(point, input)``, in the units of the samples given.
+        Representative inputs, shape ``(point, input)``, in the units of the samples.
     labels
         The point that each sample belongs to (its nearest), shape ``(sample,)``.
     """

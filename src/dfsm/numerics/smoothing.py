@@ -111,10 +111,10 @@ def smoothing_spline(time: ArrayLike, values: ArrayLike, step: float | None = No
     mesh = _mesh(t.tobytes())
     z = (y - centre) / scale
     # Noise beyond a thousand times the signal's range leaves a parabola, as a thousand does.
-    found = _choose(mesh, z, None if known is None else min(known / scale, 1e3) ** 2)
-    if found is None:
+    choice = _choose(mesh, z, None if known is None else min(known / scale, 1e3) ** 2)
+    if choice is None:
         return SmoothResult(*interpolate(t, y), 0.0, 0.0, float(len(t)), "interpolation")
-    level, lam, noise, chosen_by = found
+    level, lam, noise, chosen_by = choice
     c, residual = level.fit(z, lam)
     spline = BSpline(level.knots, c, _DEGREE)
     return SmoothResult(

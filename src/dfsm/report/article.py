@@ -146,11 +146,11 @@ class Figure:
 
 def legend(panels: Sequence[Panel]) -> list[Curve]:
     """One curve for each name, in the order of their first appearance."""
-    found: dict[str, Curve] = {}
+    shown: dict[str, Curve] = {}
     for panel in panels:
         for curve in panel.curves:
-            found.setdefault(curve.name, curve)
-    return list(found.values())
+            shown.setdefault(curve.name, curve)
+    return list(shown.values())
 
 
 @dataclass(frozen=True)

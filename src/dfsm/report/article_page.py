@@ -53,15 +53,15 @@ def _section(section: Section) -> Markup:
     )
 
 
-def _table(given: Table) -> Markup:
+def _table(content: Table) -> Markup:
     def cell(text: str, column: int) -> object:
-        if not given.is_text(column):
+        if not content.is_text(column):
             return element("span", text)  # a number that is written out aligns right
         return Cell(text, "long") if len(text) > _LONG else text
 
-    rows = [[cell(text, j) for j, text in enumerate(row)] for row in given.texts()]
-    made = table(given.caption, [], list(given.columns), rows)
-    return join(made, element("p", given.note, cls="note") if given.note else "")
+    rows = [[cell(text, j) for j, text in enumerate(row)] for row in content.texts()]
+    made = table(content.caption, [], list(content.columns), rows)
+    return join(made, element("p", content.note, cls="note") if content.note else "")
 
 
 def _figure(figure: Figure) -> Markup:

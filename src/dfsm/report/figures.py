@@ -66,9 +66,9 @@ def page_data(validations: Mapping[str, Validation]) -> dict[str, Any]:
 def bands_of(validation: Validation, run: RunComparison) -> tuple[Band, ...]:
     """Frequency bands in which peaks of this run were compared."""
     first = next(iter(validation.models.values()))
-    found = frequency_bands(first, run.recorded)
+    bands = frequency_bands(first, run.recorded)
     # A rotor that stands still or turns backwards has no blade-passing band.
-    return tuple(b for b in found if b is not LOW and b.high > b.low >= 0)
+    return tuple(b for b in bands if b is not LOW and b.high > b.low >= 0)
 
 
 def thin(run: Trajectory) -> tuple[float, float, Array]:
@@ -146,10 +146,10 @@ def _spectra(
     """Spectra up to 1 Hz; None where the rollout did not complete."""
     if not statistics:
         return {"psd": None}
-    found = [_shown(statistics[name].spectrum) for name in names]
-    frequency = found[0].frequency
+    spectra = [_shown(statistics[name].spectrum) for name in names]
+    frequency = spectra[0].frequency
     return {
-        "psd": [blobs.add(s.density) for s in found],
+        "psd": [blobs.add(s.density) for s in spectra],
         "df": float(frequency[1] - frequency[0]) if len(frequency) > 1 else 1.0,
     }
 
@@ -200,11 +200,11 @@ def _range(name: str, run: RunComparison, drawn: Sequence[Trajectory]) -> list[f
 
 def _histogram(validation: Validation, name: str, blobs: Blobs) -> dict[str, Any] | None:
     """Share of samples per bin in %; None where the variants have no completed run in common."""
-    found = validation.histograms[name]
-    if not found.counts or not all(counts.sum() for counts in found.counts.values()):
+    histogram = validation.histograms[name]
+    if not histogram.counts or not all(counts.sum() for counts in histogram.counts.values()):
         return None
-    centres = (found.edges[1:] + found.edges[:-1]) / 2
+    centres = (histogram.edges[1:] + histogram.edges[:-1]) / 2
     return {
         "x": blobs.add(centres),
-        "share": {m: blobs.add(100 * c / c.sum()) for m, c in found.counts.items()},
+        "share": {m: blobs.add(100 * c / c.sum()) for m, c in histogram.counts.items()},
     }

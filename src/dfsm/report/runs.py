@@ -17,10 +17,10 @@ def peaks(name: str, validation: Validation, run: RunComparison) -> Markup:
         for band in bands:
             row: list[object] = [c.name, band.name, _hertz(recorded, band.name)]
             for model in run.models.values():
-                found = model.statistics.get(c.name)
+                simulated = model.statistics.get(c.name)
                 row += [
-                    _hertz(found, band.name),
-                    _ratio(found, recorded, band.name),
+                    _hertz(simulated, band.name),
+                    _ratio(simulated, recorded, band.name),
                 ]
             rows.append(row)
     grid = table(
@@ -37,8 +37,8 @@ def ranges(name: str, validation: Validation, run: RunComparison) -> Markup:
     shown = "multi-fidelity" if "multi-fidelity" in run.models else next(iter(run.models))
     rows = []
     for c in validation.channels:
-        recorded, found = run.statistics[c.name], run.models[shown].statistics.get(c.name)
-        rows.append([c.name, c.unit or "—", *_four(recorded), *_four(found)])
+        recorded, simulated = run.statistics[c.name], run.models[shown].statistics.get(c.name)
+        rows.append([c.name, c.unit or "—", *_four(recorded), *_four(simulated)])
     grid = table(
         f"{name}, {run.recorded.name}: range of every signal",
         [("", 2), ("recorded", 4), (shown, 4)],
@@ -62,8 +62,8 @@ def damage(name: str, validation: Validation, run: RunComparison) -> Markup:
         for exponent, recorded in run.statistics[c.name].damage.items():
             row: list[object] = [c.name, c.unit or "—", exponent, recorded]
             for model in run.models.values():
-                found = model.statistics.get(c.name)
-                value = found.damage[exponent] if found else None
+                simulated = model.statistics.get(c.name)
+                value = simulated.damage[exponent] if simulated else None
                 relative = value / recorded - 1 if value is not None and recorded else None
                 row += [value, Markup(percent(relative))]
             rows.append(row)
@@ -78,17 +78,19 @@ def damage(name: str, validation: Validation, run: RunComparison) -> Markup:
     return join(grid, _incomplete(run))
 
 
-def _hertz(found: ChannelStatistics | None, band: str) -> Markup | None:
-    peak = found.peaks.get(band) if found else None
+def _hertz(simulated: ChannelStatistics | None, band: str) -> Markup | None:
+    peak = simulated.peaks.get(band) if simulated else None
     # A Welch bin is 0.005 Hz wide: more digits would say nothing.
     return None if peak is None else Markup(f"{peak:.3f}")
 
 
-def _ratio(found: ChannelStatistics | None, recorded: ChannelStatistics, band: str) -> float | None:
+def _ratio(
+    simulated: ChannelStatistics | None, recorded: ChannelStatistics, band: str
+) -> float | None:
     power = recorded.power.get(band)
-    if found is None or not power:
+    if simulated is None or not power:
         return None
-    return found.power[band] / power
+    return simulated.power[band] / power
 
 
 def _incomplete(run: RunComparison, shown: list[str] | None = None) -> Markup:

@@ -242,12 +242,13 @@ def _share(value: float | None) -> Markup:
 
 def shading(_name: str, validation: Validation) -> Markup:
     """What the band in the time series stands for; the page's script colours the patch."""
-    found = validation.intervals
-    if found is None:
+    intervals = validation.intervals
+    if intervals is None:
         return Markup("")
     text = (
         "Around the multi-fidelity rollout: where the record of a new run is expected "
-        f"{100 * found.level:g} % of the time, calibrated on {plural(len(found.runs), 'run')}."
+        f"{100 * intervals.level:g} % of the time, "
+        f"calibrated on {plural(len(intervals.runs), 'run')}."
     )
     return element("p", element("span", cls="patch interval"), text, cls="note")
 

@@ -163,7 +163,7 @@ def compare(
         Runs to rank by; those that are among `runs` are not trained with. None holds out some
         of `runs`.
     hold_out
-        Share of the runs that is held out where no `validation` is given, at least one.
+        Share of the runs that is held out where there is no `validation`, at least one.
     jobs
         Number of processes; None takes half the processors. With one, all is done in this one.
 
@@ -184,7 +184,7 @@ def compare(
     course = Course.of(training, judged, next(iter(candidates.values())).settings)
     marks = {name: c.fingerprint(course) for name, c in candidates.items()}
     output.mkdir(exist_ok=True)
-    outcomes = {n: found for n, mark in marks.items() if (found := _kept(output, n, mark))}
+    outcomes = {n: kept for n, mark in marks.items() if (kept := _kept(output, n, mark))}
     kept = set(outcomes)
     tasks: list[_Task] = [(n, c) for n, c in candidates.items() if n not in kept]
     jobs = default_jobs() if jobs is None else jobs
@@ -294,9 +294,9 @@ def _shares(
 
 
 def _score(outcome: Outcome, states: Iterable[str]) -> float | None:
-    found = [outcome.nrmse.get(n) for n in states]
-    values = [v for v in found if v is not None]
-    if len(values) < len(found):
+    errors = [outcome.nrmse.get(n) for n in states]
+    values = [v for v in errors if v is not None]
+    if len(values) < len(errors):
         return None
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -330,8 +330,8 @@ def _write(
     """Model first: a result that stands belongs to the model beside it."""
     if model is not None:
         save(model, output / name)
-    found = {"format": _FORMAT, "outcome": asdict(outcome), "model": _digest(output / name)}
-    write_json(_result_file(output, name), found | record)
+    content = {"format": _FORMAT, "outcome": asdict(outcome), "model": _digest(output / name)}
+    write_json(_result_file(output, name), content | record)
 
 
 def _kept(output: Path, name: str, fingerprint: str) -> Outcome | None:
@@ -341,12 +341,12 @@ def _kept(output: Path, name: str, fingerprint: str) -> Outcome | None:
             shutil.rmtree(left, ignore_errors=True)
         else:
             left.unlink(missing_ok=True)
-    found = _read(_result_file(output, name))
-    if found is None or found.get("fingerprint") != fingerprint:
+    content = _read(_result_file(output, name))
+    if content is None or content.get("fingerprint") != fingerprint:
         return None
-    outcome: Outcome = found["outcome"]
+    outcome: Outcome = content["outcome"]
     # One that failed is cheap to try again, and the reason may be gone.
-    if outcome.message or found.get("model") != _digest(output / name):
+    if outcome.message or content.get("model") != _digest(output / name):
         return None
     try:
         load(output / name)
@@ -357,10 +357,10 @@ def _kept(output: Path, name: str, fingerprint: str) -> Outcome | None:
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["format"] != _FORMAT:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != _FORMAT:
             return None
-        return found | {"outcome": TypeAdapter(Outcome).validate_python(found["outcome"])}
+        return content | {"outcome": TypeAdapter(Outcome).validate_python(content["outcome"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 

@@ -145,9 +145,9 @@ def try_out(course: Course, candidate: Candidate) -> tuple[Outcome, DFSM | None]
 def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
     window: dict[str, Any] = {"start": settings.start, "stop": settings.stop}
     simulate(model, course.validation, **window)  # compiles
-    found = simulate(model, course.validation, **window)
-    diverged = sum(s.status is not Status.COMPLETED for s in found)
-    pairs = list(zip((s.trajectory for s in found), course.references, strict=True))
+    simulations = simulate(model, course.validation, **window)
+    diverged = sum(s.status is not Status.COMPLETED for s in simulations)
+    pairs = list(zip((s.trajectory for s in simulations), course.references, strict=True))
     measured = [c.name for c in model.signals.observed if c.name in course.references[0]]
     nrmse = {
         n: None
@@ -158,17 +158,17 @@ def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
     return Outcome(
         nrmse=nrmse,
         diverged=diverged,
-        simulate_seconds=float(np.mean([s.wall_time for s in found])),
+        simulate_seconds=float(np.mean([s.wall_time for s in simulations])),
         parameters=Parametrization.of(model, np.ones(len(model.signals.observed))).size,
     )
 
 
 def _reference(run: Trajectory, settings: FitSettings) -> dict[str, Array]:
     run = with_computed(run, settings.hub_height, settings.features)
-    found = differentiate(run, settings.states, settings.derivatives)
+    rates = differentiate(run, settings.states, settings.derivatives)
     recorded = run.window(settings.start, settings.stop)
-    extracted = found.trajectory.window(settings.start, settings.stop)
-    values = {n: recorded[n] if n in recorded else extracted[n] for n in found.names}
+    extracted = rates.trajectory.window(settings.start, settings.stop)
+    values = {n: recorded[n] if n in recorded else extracted[n] for n in rates.names}
     for name, value in values.items():
         if not spread(value):
             raise DfsmError(

@@ -248,7 +248,7 @@ def _march(
 
 
 def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = np.inf) -> jax.Array:
-    """Classical RK4 over given steps; JAX can follow it.
+    """Classical RK4 over steps of any lengths; JAX can follow it.
 
     Parameters
     ----------

@@ -167,8 +167,7 @@ def simulate(
         The surrogate.
     runs
         Trajectories that hold the model's controls, disturbances and parameters, and its measured
-        states unless `initial` is given. Samples before `start` serve only to find the initial
-        rates.
+        states unless there is `initial`. Samples before `start` serve only for the initial rates.
     start, stop
         Time window in s; None leaves that end open.
     initial
@@ -206,11 +205,11 @@ def simulate(
     driven = [r.select(names).window(start, stop).require_finite() for r in batch]
     for run in driven:
         require_constant(run, model.signals.names("parameters"))
-    given = None if initial is None else _given(model, initial, len(batch))
+    starts = None if initial is None else _starts(model, initial, len(batch))
 
     def case(i: int, drive: Drive) -> Case[Drive]:
         begins = float(driven[i].time[0])
-        x0 = _observed_state(model, batch[i], begins) if given is None else given[i]
+        x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
         return Case(drive, x0, _initial_azimuth(model, batch[i], begins))
@@ -253,16 +252,16 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     return np.concatenate([_observed_state(model, run, start), latent])
 
 
-def _given(model: DFSM, initial: ArrayLike, runs: int) -> Array:
-    """Initial states of every run as given, ``(run, state)``, with the latent ones or without."""
-    given, s = np.asarray(initial, dtype=np.float64), model.signals
+def _starts(model: DFSM, initial: ArrayLike, runs: int) -> Array:
+    """Initial states of every run, ``(run, state)``, with the latent ones or without."""
+    starts, s = np.asarray(initial, dtype=np.float64), model.signals
     lengths = (len(s.states), len(s.observed)) if s.latents else (len(s.states),)
     shapes = [shape for n in lengths for shape in ((n,), (runs, n))]
-    if given.shape not in shapes:
+    if starts.shape not in shapes:
         raise DfsmError(
-            f"initial has shape {given.shape}, expected {' or '.join(map(str, shapes))}"
+            f"initial has shape {starts.shape}, expected {' or '.join(map(str, shapes))}"
         )
-    return np.broadcast_to(given, (runs, given.shape[-1]))
+    return np.broadcast_to(starts, (runs, starts.shape[-1]))
 
 
 def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
@@ -285,8 +284,8 @@ def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     else:
         head = max(start + _HEAD, float(run.time[min(len(run), _HEAD_SAMPLES) - 1]))
         piece, row = run.window(start, head), 0
-    found = differentiate(piece.require_finite(), specs, s.derivatives)
-    return found.trajectory.select(found.names).values[row]
+    extracted = differentiate(piece.require_finite(), specs, s.derivatives)
+    return extracted.trajectory.select(extracted.names).values[row]
 
 
 def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:

@@ -71,7 +71,7 @@ class ODESystem:
     Raises
     ------
     DfsmError
-        No states, a name given twice, g without outputs or outputs without g, a function that
+        No states, a name that occurs twice, g without outputs or outputs without g, a function that
         does not take four arguments, an unknown backend, or a tolerance that is not positive.
     """
 

@@ -202,8 +202,8 @@ def _solve_segments(
             rtol=tolerances[0],
             atol=tolerances[1],
         )
-        found = solution.y.T[: rows.sum()]
-        states[np.flatnonzero(rows)[: len(found)]] = found
+        solved = solution.y.T[: rows.sum()]
+        states[np.flatnonzero(rows)[: len(solved)]] = solved
         if not solution.success:
             break
         x = solution.y[:, -1]

@@ -55,7 +55,7 @@ def as_vector(what: str, value: ArrayLike, channels: Sequence[Channel]) -> Array
 
 def as_signal(
     what: str,
-    given: Signal | Trajectory | ArrayLike | None,
+    source: Signal | Trajectory | ArrayLike | None,
     channels: Sequence[Channel],
     time: Array,
 ) -> Signal:
@@ -65,7 +65,7 @@ def as_signal(
     ----------
     what
         Begins the messages.
-    given
+    source
         A signal, a run with the channels, samples at `time`, or constants; None for no channels.
     channels
         Expected.
@@ -82,30 +82,32 @@ def as_signal(
     DfsmError
         The shape does not fit, a sample is not finite, or the signal does not cover the time.
     """
-    if isinstance(given, Trajectory):
+    if isinstance(source, Trajectory):
         names = [c.name for c in channels]
-        given = interpolated(given.time, given.select(names).require_finite().values)
-    if isinstance(given, get_args(Excitation)):
-        raise DfsmError(f"{what}: a {type(given).__name__}, draw a signal from it with excite")
-    if not isinstance(given, Signal):
-        if given is None and channels:
+        source = interpolated(source.time, source.select(names).require_finite().values)
+    if isinstance(source, get_args(Excitation)):
+        raise DfsmError(f"{what}: a {type(source).__name__}, draw a signal from it with excite")
+    if not isinstance(source, Signal):
+        if source is None and channels:
             raise DfsmError(f"{what} are missing, expected {_told(channels)}")
-        given = _from_samples(what, np.empty(0) if given is None else given, channels, time)
-    width = given(given.span[0]).shape[-1]
+        source = _from_samples(what, np.empty(0) if source is None else source, channels, time)
+    width = source(source.span[0]).shape[-1]
     if width != len(channels):
         raise DfsmError(f"{what}: a signal of {width} channels, expected {_told(channels)}")
-    start, stop = given.span
+    start, stop = source.span
     slack = 1e-9 * (stop - start)
     if time[0] < start - slack or time[-1] > stop + slack:
         raise DfsmError(
             f"{what} last from {start:g} s to {stop:g} s, the simulation from {time[0]:g} s to "
             f"{time[-1]:g} s: make them longer or simulate less"
         )
-    return given
+    return source
 
 
-def _from_samples(what: str, given: ArrayLike, channels: Sequence[Channel], time: Array) -> Signal:
-    values = _numbers(what, given)
+def _from_samples(
+    what: str, samples: ArrayLike, channels: Sequence[Channel], time: Array
+) -> Signal:
+    values = _numbers(what, samples)
     n = len(channels)
     if values.shape not in ((n,), (len(time), n)):
         raise DfsmError(
@@ -126,7 +128,7 @@ def draw_vector(
     k: int,
     seed: Sequence[int],
 ) -> Array:
-    """Values of run `k`: drawn, or the next of the given rows, shape ``(channel,)``."""
+    """Values of run `k`: drawn, or the next of the rows, shape ``(channel,)``."""
     if isinstance(excitation, Uniform):
         return excitation.draw(len(channels), seed)
     rows = _numbers(what, excitation)
@@ -166,8 +168,8 @@ def _told(channels: Sequence[Channel]) -> str:
     return f"({len(channels)},): {', '.join(c.name for c in channels)}" if channels else "(0,)"
 
 
-def _numbers(what: str, given: ArrayLike) -> Array:
+def _numbers(what: str, value: ArrayLike) -> Array:
     try:
-        return np.array(given, dtype=np.float64)
+        return np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise DfsmError(f"{what}: a {type(given).__name__}, expected numbers") from None
+        raise DfsmError(f"{what}: a {type(value).__name__}, expected numbers") from None

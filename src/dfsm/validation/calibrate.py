@@ -38,7 +38,7 @@ def calibrate(
     stop: float | None = None,
     settings: SimulationSettings | None = None,
 ) -> Intervals:
-    """Find intervals that hold the record of a new run for a given share of the time.
+    """Intervals that hold the record of a new run for a share of the time.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def calibrate(
     Raises
     ------
     DfsmError
-        Too few runs, one given twice, a rollout that ended early, or a level outside (0, 1).
+        Too few runs, one that occurs twice, a rollout that ended early, or a level outside (0, 1).
     """
     require(0 < level < 1, "level", level, "a share between 0 and 1")
     s = model.signals
@@ -70,14 +70,14 @@ def calibrate(
         raise DfsmError(
             f"intervals are calibrated on at least {_FEWEST} runs, {len(runs)} were given"
         )
-    Dataset(runs)  # refuses a run that is given twice
-    found = validate({"model": model}, runs, start=start, stop=stop, settings=settings)
+    Dataset(runs)  # refuses a run that occurs twice
+    validation = validate({"model": model}, runs, start=start, stop=stop, settings=settings)
     errors, schedules = [], []
-    for run, compared in zip(runs, found.runs, strict=True):
+    for run, compared in zip(runs, validation.runs, strict=True):
         rollout = compared.models["model"].simulation
         if rollout.status is not Status.COMPLETED:
             raise DfsmError(f"{run.where}: {rollout.message}; no interval holds such a rollout")
-        names = [c.name for c in found.channels]
+        names = [c.name for c in validation.channels]
         truth = compared.recorded.select(names).values
         errors.append(rollout.trajectory.select(names).values - truth)
         schedules.append(schedule_along(model.schedule, run, rollout.trajectory))
@@ -89,8 +89,8 @@ def calibrate(
         scores.append(np.abs(e) / interpolated(grid, scale, at))
     multiple = np.quantile(np.concatenate(scores), level, axis=0)
     return Intervals(
-        channels=tuple(c.name for c in found.channels),
-        units=tuple(c.unit for c in found.channels),
+        channels=tuple(c.name for c in validation.channels),
+        units=tuple(c.unit for c in validation.channels),
         schedule=model.schedule,
         grid=grid,
         half_width=multiple * _scale(squares),
@@ -123,6 +123,6 @@ def _scale(sums: Sequence[tuple[Array, Array]]) -> Array:
     weight, total = (np.sum([s[k] for s in sums], axis=0) for k in (0, 1))
     overall = total.sum(axis=0) / weight.sum()
     # As good as a sample of the overall error: a point that was hardly visited leans on the rest.
-    found = np.sqrt((total + overall) / (weight + 1)[:, None])
+    spread = np.sqrt((total + overall) / (weight + 1)[:, None])
     # A channel that is always zero has no error to be divided by.
-    return np.maximum(found, np.finfo(float).tiny)
+    return np.maximum(spread, np.finfo(float).tiny)

@@ -189,26 +189,26 @@ def load_intervals(path: str | Path) -> Intervals:
     if isinstance(version, int):
         check_format(path, version, _FORMAT)
     try:
-        found = _File.model_validate(raw)
+        content = _File.model_validate(raw)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise _foreign(path, f"{where or 'all of it'}: {first['msg'].lower()}") from None
-    if not (np.diff(found.grid) > 0).all():
+    if not (np.diff(content.grid) > 0).all():
         raise _foreign(path, "its grid does not increase")
-    points = len(found.grid)
-    if any(len(c.half_width) != points for c in found.channels):
+    points = len(content.grid)
+    if any(len(c.half_width) != points for c in content.channels):
         raise _foreign(path, f"a channel has not one half-width for each of {points} grid points")
     return Intervals(
-        channels=tuple(c.name for c in found.channels),
-        units=tuple(c.unit for c in found.channels),
-        schedule=found.schedule,
-        grid=np.array(found.grid),
-        half_width=np.array([c.half_width for c in found.channels]).T,
-        level=found.level,
-        runs=tuple(r.name for r in found.runs),
-        digests=tuple(r.sha256 for r in found.runs),
-        warnings=tuple(found.warnings),
+        channels=tuple(c.name for c in content.channels),
+        units=tuple(c.unit for c in content.channels),
+        schedule=content.schedule,
+        grid=np.array(content.grid),
+        half_width=np.array([c.half_width for c in content.channels]).T,
+        level=content.level,
+        runs=tuple(r.name for r in content.runs),
+        digests=tuple(r.sha256 for r in content.runs),
+        warnings=tuple(content.warnings),
     )
 
 

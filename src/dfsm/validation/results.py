@@ -93,7 +93,7 @@ class ModelRun:
         NRMSE of each state derivative along the recorded trajectory, by state name.
     band, coverage
         Lower and upper ends of prediction intervals, and per channel the share of the time that
-        the record lies between them; only where intervals were given and the rollout completed.
+        the record lies between them; only where there are intervals and the rollout completed.
     """
 
     simulation: Simulation
@@ -145,7 +145,7 @@ class Validation:
     channels
         States and outputs, in the order shown.
     runs
-        Test runs in the order given.
+        Test runs, in the caller's order.
     histograms
         Per channel, over the runs that all models completed which completed any.
     eigenvalues
@@ -155,7 +155,7 @@ class Validation:
     warnings
         What a reader should know before trusting the figures.
     intervals
-        Prediction intervals of the multi-fidelity model, if given.
+        Prediction intervals of the multi-fidelity model, if any.
     """
 
     models: Mapping[str, DFSM]
@@ -173,9 +173,9 @@ class Validation:
         for model in self.models:
             line = f"  {model}: {self.completed(model)} of {len(self.runs)} rollouts completed"
             means = {c.name: self.mean_nrmse(model, c.name) for c in self.channels}
-            found = [(v, name) for name, v in means.items() if v is not None]
-            if found:
-                (low, best), (high, worst) = min(found), max(found)
+            ranked = [(v, name) for name, v in means.items() if v is not None]
+            if ranked:
+                (low, best), (high, worst) = min(ranked), max(ranked)
                 line += f", mean NRMSE {low:.2f} ({best}) to {high:.2f} ({worst})"
             lines.append(printable(line))
         return "\n".join(lines) + ">"
@@ -186,16 +186,16 @@ class Validation:
 
     def mean_error(self, model: str, channel: str, what: str) -> float | None:
         """Mean of one figure of `ChannelError` over the test runs, as `mean_nrmse`."""
-        found = [r.models[model].errors.get(channel) for r in self.runs]
-        values = [getattr(e, what) for e in found if e is not None]
+        errors = [r.models[model].errors.get(channel) for r in self.runs]
+        values = [getattr(e, what) for e in errors if e is not None]
         return float(np.mean(values)) if len(values) == len(self.runs) else None
 
     def coverage(self, channel: str) -> list[float] | None:
         """Share of the time inside the prediction intervals per run; None as for `mean_nrmse`."""
         if self.intervals is None:
             return None
-        found = [r.models[MULTI_FIDELITY].coverage.get(channel) for r in self.runs]
-        shares = [share for share in found if share is not None]
+        coverage = [r.models[MULTI_FIDELITY].coverage.get(channel) for r in self.runs]
+        shares = [share for share in coverage if share is not None]
         return shares if len(shares) == len(self.runs) else None
 
     def endings(self) -> list[str]:
@@ -209,15 +209,15 @@ class Validation:
 
     def outside(self) -> list[str]:
         """One sentence per model that spent much of its time outside the training range."""
-        found = []
+        sentences = []
         for name in self.models:
             shares = [r.models[name].simulation.outside for r in self.runs]
             if max(shares) > MUCH_OUTSIDE:
-                found.append(
+                sentences.append(
                     f"{name}: up to {max(shares):.0%} of a rollout has an input or state outside "
                     "the training range"
                 )
-        return found
+        return sentences
 
     def completed(self, model: str) -> int:
         """Number of test runs that a model simulated to the end."""
@@ -278,7 +278,7 @@ class Validation:
 
 
 def _run_dict(run: RunComparison) -> dict[str, Any]:
-    def statistics(found: Mapping[str, ChannelStatistics]) -> dict[str, Any]:
+    def statistics(of: Mapping[str, ChannelStatistics]) -> dict[str, Any]:
         return {
             name: {
                 "min": s.minimum,
@@ -289,7 +289,7 @@ def _run_dict(run: RunComparison) -> dict[str, Any]:
                 "band_power": dict(s.power),
                 "del_1hz": dict(s.damage),
             }
-            for name, s in found.items()
+            for name, s in of.items()
         }
 
     return {

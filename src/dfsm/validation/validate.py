@@ -119,10 +119,10 @@ def compared(model: DFSM, nonlinear: DFSM | None = None) -> dict[str, DFSM]:
     nonlinear
         The nonlinear-only model, if there is one.
     """
-    found = {"linear-fit": model.linear_fit(), MULTI_FIDELITY: model}
+    variants = {"linear-fit": model.linear_fit(), MULTI_FIDELITY: model}
     if nonlinear is not None:
-        found["nonlinear-only"] = nonlinear
-    return found
+        variants["nonlinear-only"] = nonlinear
+    return variants
 
 
 def _compare(
@@ -134,9 +134,9 @@ def _compare(
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
-    found = differentiate(run, s.specs, s.derivatives)
-    inside = found.trajectory.window(*window)
-    rows = np.isin(found.trajectory.time, inside.time)
+    rates = differentiate(run, s.specs, s.derivatives)
+    inside = rates.trajectory.window(*window)
+    rows = np.isin(rates.trajectory.time, inside.time)
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
     results = {}
@@ -161,7 +161,7 @@ def _compare(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
-            derivative_errors=_derivative_errors(first, predicted, found.derivatives[rows]),
+            derivative_errors=_derivative_errors(first, predicted, rates.derivatives[rows]),
             band=band,
             coverage=coverage,
         )

@@ -150,8 +150,8 @@ def _expand(pattern: str | Path, base: Path | None) -> list[Path]:
         return [existing_file(literal)]
     # Path.glob refuses absolute patterns, which is what a shell or a configuration may hold.
     matches = glob.glob(str(pattern), root_dir=base, recursive=True)  # noqa: PTH207
-    found = [folder / match for match in sorted(matches)]
-    files = [p for p in found if p.is_file()]
+    paths = [folder / match for match in sorted(matches)]
+    files = [p for p in paths if p.is_file()]
     if not files:
         raise DfsmError(
             f"no file matches '{pattern}' in {folder.absolute()}: check the folder and the pattern"

@@ -32,7 +32,7 @@ def assemble(
     Parameters
     ----------
     path
-        The file; its stem is the run's name unless `name` is given.
+        The file; its stem is the run's name unless there is a `name`.
     time
         Time mesh in s, shape ``(time,)``.
     values

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CODE_MIN, CODE_MAX = -32768, 32767
 # How far, in steps, a sample may lie off the grid: rounding in float64 stays far below.
 GRID_SLACK = 1e-3
-# The codes' place in the 16-bit range is found by trial where they leave room.
+# The codes' place in the 16-bit range is tried out where they leave room.
 MAX_SHIFTS = 64
 
 
@@ -126,7 +126,7 @@ def _pack(values: Array, step: float) -> tuple[NDArray[np.int32], float, float] 
     if span > CODE_MAX - CODE_MIN or np.abs(values - low - grid * step).max() > GRID_SLACK * step:
         return None
     # OpenFAST holds scale and offset in single precision and fills the range from its bottom.
-    # Where that is how the values came about, they are found again to the last bit.
+    # Where that is how the values came about, they come back to the last bit.
     scale = float(np.float32(1 / step))
     for first in range(CODE_MIN, min(CODE_MIN + MAX_SHIFTS, CODE_MAX - span + 1)):
         codes = grid + first

@@ -1,4 +1,4 @@
-"""The two-link robot study, told: what was found, beside what the paper says."""
+"""The two-link robot study, told: its figures beside those of the paper."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def robot_article(study: RobotStudy) -> Article:
             taylor_section(study.taylor),
             multi_fidelity_section(study.multi_fidelity),
             *([_chaos(study.multi_fidelity.chaos)] if study.multi_fidelity.chaos else []),
-            beyond_section(study.kinds, study.multi_fidelity.found[MULTI]),
+            beyond_section(study.kinds, study.multi_fidelity.assessed[MULTI]),
         ),
     )
 
@@ -148,7 +148,7 @@ def multi_fidelity_section(m: MultiFidelity) -> Section:
         ("Model", "build (s)", *HORIZONTAL_RATES, *HORIZONTAL),
         tuple(
             (name, a.seconds, *a.slopes.tolist(), *a.rollouts.rmse.tolist())
-            for name, a in (m.found | {f"MF, {n}": a for n, a in m.changed.items()}).items()
+            for name, a in (m.assessed | {f"MF, {n}": a for n, a in m.changed.items()}).items()
         ),
         note=(
             "Derivatives along the recorded runs, against the true ones; states along the model's "
@@ -168,8 +168,8 @@ def multi_fidelity_section(m: MultiFidelity) -> Section:
             (n, a.seconds, b.seconds, float(r), *_pairs(a, b))
             for n, a, b, r in zip(
                 m.sweep.samples,
-                m.sweep.found[MULTI],
-                m.sweep.found[NONLINEAR],
+                m.sweep.assessed[MULTI],
+                m.sweep.assessed[NONLINEAR],
                 m.sweep.speed_ups,
                 strict=True,
             )
@@ -202,7 +202,7 @@ def _pairs(a: Assessed, b: Assessed) -> list[float]:
 def _chaos(c: Chaos) -> Section:
     of_slopes, of_states = c.spread
     rows = []
-    for name, a in c.found.items():
+    for name, a in c.assessed.items():
         short, count = c.short[name], len(c.short[name].errors)
         rows.append((f"{name}: derivative", *(a.slopes / of_slopes).tolist(), ""))
         rows.append(

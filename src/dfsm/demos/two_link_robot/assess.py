@@ -121,11 +121,11 @@ def roll(model: DFSM, runs: Sequence[Trajectory]) -> Rollouts:
     """Simulate a model with the inputs of runs of one length and compare the states."""
     recorded = np.stack([states(model, run) for run in runs])
     with hushed():
-        found = simulate(model, runs, initial=recorded[:, 0])
+        simulations = simulate(model, runs, initial=recorded[:, 0])
     errors = np.full(recorded.shape, np.nan)
-    for k, simulation in enumerate(found):
+    for k, simulation in enumerate(simulations):
         simulated = states(model, simulation.trajectory)
         # The last sample of a rollout that ended early shows where it went; it is no error.
         count = len(simulated) - (simulation.status is not Status.COMPLETED)
         errors[k, :count] = simulated[:count] - recorded[k, :count]
-    return Rollouts(runs[0].time, errors, np.array([s.outside for s in found]))
+    return Rollouts(runs[0].time, errors, np.array([s.outside for s in simulations]))

@@ -1,4 +1,4 @@
-"""What the paper claims about the two-link robot, what was found, and whether it holds."""
+"""What the paper claims about the two-link robot, the same figures here, and whether it holds."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _largest_share(decisions: Sequence[dict[str, Any]]) -> str:
 
 
 def _claim_correction(m: MultiFidelity) -> tuple[str, ...]:
-    linear, multi = m.found[LINEAR].slopes[:2], m.found[MULTI].slopes[:2]
+    linear, multi = m.assessed[LINEAR].slopes[:2], m.assessed[MULTI].slopes[:2]
     factors = [cell_text(float(f), 2) for f in linear / multi]
     return (
         "The corrective function reduces the derivative error significantly (3.8.2)",
@@ -96,7 +96,7 @@ def _claim_correction(m: MultiFidelity) -> tuple[str, ...]:
 def _claim_accuracy(m: MultiFidelity) -> tuple[str, ...]:
     ratios = [
         _overall(b) / _overall(a)
-        for a, b in zip(m.sweep.found[MULTI], m.sweep.found[NONLINEAR], strict=True)
+        for a, b in zip(m.sweep.assessed[MULTI], m.sweep.assessed[NONLINEAR], strict=True)
     ]
     good = [r >= 1 - _ALIKE for r in ratios]
     each = ", ".join(

@@ -74,15 +74,15 @@ def fit_kinds(
         By name.
     """
     robot = two_link_robot()
-    found = {}
+    fits = {}
     for name, kind in track(kinds.items(), "corrective functions"):
         with hushed():
             result = fit(train, choices(robot, kind))
         seconds = float(sum(result.seconds.values()))
         first = result.model.provenance.record["rows"][0]["decision"]
-        found[name] = Fitted(
+        fits[name] = Fitted(
             short=assess(result.model, seconds, robot, tests),
             long=roll(result.model, long),
             detail=first[first.rfind("(") + 1 :].rstrip(")"),
         )
-    return found
+    return fits

@@ -174,8 +174,10 @@ def extraction(size: ExtractionSettings, seed: int) -> Extraction:
 
     def errors(duration: float, runs: int, tolerance: float | None) -> Array:
         time = np.linspace(0.0, duration, size.points)
-        found = around(robot, runs, time, DELTA, seed, tolerance)
-        return np.mean([np.abs(extracted(r) - robot.derivative(r)).mean(axis=0) for r in found], 0)
+        runs_around = around(robot, runs, time, DELTA, seed, tolerance)
+        return np.mean(
+            [np.abs(extracted(r) - robot.derivative(r)).mean(axis=0) for r in runs_around], 0
+        )
 
     mean = errors(DURATION, size.runs, None)
     durations = [(DURATION, float(mean.mean()), float(errors(DURATION, size.runs, _TIGHT).mean()))]

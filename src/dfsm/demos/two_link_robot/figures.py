@@ -33,17 +33,17 @@ _TIME = "time (s)"
 
 def extraction(e: Extraction) -> Figure:
     """Fig. 1, and the error against the sampling step."""
-    time, true, found = e.example
+    time, true, extracted = e.example
     panels = [
         Panel(
             _GRAVITY_RATES[k][0],
             _TIME,
             _GRAVITY_RATES[k][1],
-            (Curve("true f", time, true[:, k], 0), Curve("spline", time, found[:, k], 1)),
+            (Curve("true f", time, true[:, k], 0), Curve("spline", time, extracted[:, k], 1)),
         )
         for k in (1, 3)
     ]
-    error = np.maximum(np.abs(found - true), 1e-12)
+    error = np.maximum(np.abs(extracted - true), 1e-12)
     panels.append(
         Panel(
             "|spline − true|",
@@ -205,7 +205,7 @@ def histograms(m: MultiFidelity) -> Figure:
     """Fig. 6."""
     panels = []
     for k, (name, unit) in enumerate(_HORIZONTAL):
-        errors = {n: m.found[n].rollouts.errors[..., k].ravel() for n in (NONLINEAR, MULTI)}
+        errors = {n: m.assessed[n].rollouts.errors[..., k].ravel() for n in (NONLINEAR, MULTI)}
         errors = {n: e[np.isfinite(e)] for n, e in errors.items()}
         pooled = np.abs(np.concatenate([*errors.values(), np.array([1e-12])]))
         limit = float(np.percentile(pooled, 99.0))
@@ -237,7 +237,7 @@ def sweep(m: MultiFidelity) -> Figure:
     def panel(title: str, unit: str, of: str) -> Panel:
         curves = []
         for n in (MULTI, NONLINEAR):
-            values = np.array([_figure(a, of) for a in s.found[n]])
+            values = np.array([_figure(a, of) for a in s.assessed[n]])
             curves += [
                 Curve(n, counts, values, _COLOURS[n]),
                 Curve(n, counts, values, _COLOURS[n], "points"),

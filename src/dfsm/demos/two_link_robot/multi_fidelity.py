@@ -96,17 +96,17 @@ class Sweep:
     ----------
     samples
         n_s.
-    found
+    assessed
         By model, one per n_s.
     """
 
     samples: tuple[int, ...]
-    found: dict[str, tuple[Assessed, ...]]
+    assessed: dict[str, tuple[Assessed, ...]]
 
     @property
     def speed_ups(self) -> Array:
         """Build time of nonlinear-only over that of multi-fidelity, shape ``(n_s,)``."""
-        pairs = zip(self.found[NONLINEAR], self.found[MULTI], strict=True)
+        pairs = zip(self.assessed[NONLINEAR], self.assessed[MULTI], strict=True)
         return np.array([n.seconds / m.seconds for n, m in pairs])
 
 
@@ -116,7 +116,7 @@ class Chaos:
 
     Attributes
     ----------
-    found
+    assessed
         By model, with rollouts over the whole time.
     short
         By model: rollouts of 0.5 s, begun at every half second of the test runs.
@@ -126,7 +126,7 @@ class Chaos:
         One of them.
     """
 
-    found: dict[str, Assessed]
+    assessed: dict[str, Assessed]
     short: dict[str, Rollouts]
     spread: tuple[Array, Array]
     series: Series
@@ -138,7 +138,7 @@ class MultiFidelity:
 
     Attributes
     ----------
-    found
+    assessed
         By model, on the arm without gravity.
     series
         One test run.
@@ -150,7 +150,7 @@ class MultiFidelity:
         The arm with gravity; None where it was left out.
     """
 
-    found: dict[str, Assessed]
+    assessed: dict[str, Assessed]
     series: Series
     sweep: Sweep
     changed: dict[str, Assessed]
@@ -208,14 +208,15 @@ def multi_fidelity(
     robot = two_link_robot()
     # What JAX compiles in a process that fits for the first time is nobody's build time.
     _fit(train[:4], recipe(robot, min(size.sweep)))
-    found = {
+    assessed = {
         n: _compared(_fit(train, recipe(robot, n)), robot, tests)
         for n in track(sorted({*size.sweep, size.samples}), "subsample sizes")
     }
     sweep = Sweep(
-        size.sweep, {m: tuple(found[n][m] for n in size.sweep) for m in (LINEAR, MULTI, NONLINEAR)}
+        size.sweep,
+        {m: tuple(assessed[n][m] for n in size.sweep) for m in (LINEAR, MULTI, NONLINEAR)},
     )
-    chosen = found[size.samples]
+    chosen = assessed[size.samples]
     chaos = _chaos(size.samples, seed) if size.gravity else None
     changed = {
         name: _changed(train, robot, tests, replace(_units(size.samples), **parts))
@@ -254,18 +255,18 @@ def _changed(
 
 
 def _series(
-    found: dict[str, Assessed], system: ODESystem, tests: Sequence[Trajectory], k: int
+    assessed: dict[str, Assessed], system: ODESystem, tests: Sequence[Trajectory], k: int
 ) -> Series:
     run = tests[k]
-    true = states(found[MULTI].model, run)
-    predicted = {name: slope(a.model, run) for name, a in found.items()}
+    true = states(assessed[MULTI].model, run)
+    predicted = {name: slope(a.model, run) for name, a in assessed.items()}
     return Series(
         time=run.time,
         controls=run.select([c.name for c in system.controls]).values,
         derivatives=system.derivative(run),
         states=true,
         predicted=predicted,
-        simulated={name: true + a.rollouts.errors[k] for name, a in found.items()},
+        simulated={name: true + a.rollouts.errors[k] for name, a in assessed.items()},
         correction=predicted[MULTI] - predicted[LINEAR],
     )
 
@@ -281,9 +282,9 @@ def _chaos(samples: int, seed: int) -> Chaos:
         seed=seed,
     )
     train, tests = runs[:TRAINING_RUNS], runs[TRAINING_RUNS:]
-    found = _compared(_fit(train, recipe(robot, samples)), robot, tests)
+    assessed = _compared(_fit(train, recipe(robot, samples)), robot, tests)
     own = _fit(train, choices(robot, RBF(samples=samples)))
-    found[OWN] = assess(own.model, sum(own.seconds.values()), robot, tests)
+    assessed[OWN] = assess(own.model, sum(own.seconds.values()), robot, tests)
     steps = round(_SHORT * _RATE)
     pieces = [
         replace(run, time=run.time[k : k + steps + 1], values=run.values[k : k + steps + 1])
@@ -291,10 +292,10 @@ def _chaos(samples: int, seed: int) -> Chaos:
         for k in range(0, len(run) - steps, steps)
     ]
     slopes = np.concatenate([robot.derivative(run) for run in tests])
-    recorded = np.concatenate([states(found[MULTI].model, run) for run in tests])
+    recorded = np.concatenate([states(assessed[MULTI].model, run) for run in tests])
     return Chaos(
-        found=found,
-        short={name: roll(a.model, pieces) for name, a in found.items()},
+        assessed=assessed,
+        short={name: roll(a.model, pieces) for name, a in assessed.items()},
         spread=(slopes.std(axis=0), recorded.std(axis=0)),
-        series=_series(found, robot, tests, 0),
+        series=_series(assessed, robot, tests, 0),
     )

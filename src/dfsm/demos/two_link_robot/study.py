@@ -57,7 +57,7 @@ QUICK = StudySettings(
 
 @dataclass(frozen=True, eq=False)
 class RobotStudy:
-    """What the study found.
+    """Results of the study.
 
     Attributes
     ----------

@@ -101,8 +101,8 @@ class TaylorComparison:
 
     def distance(self, which: Array, offset: bool = True) -> Array:
         """Largest distance of the fitted poles from `which`, for every δ."""
-        found = [f.poles if offset else f.without_offset for f in self.fits]
-        return np.array([np.abs(poles - which).max() for poles in found])
+        computed = [f.poles if offset else f.without_offset for f in self.fits]
+        return np.array([np.abs(poles - which).max() for poles in computed])
 
 
 def compare_with_taylor(size: TaylorSettings, seed: int) -> TaylorComparison:
@@ -162,8 +162,8 @@ def _linear_fit(robot: ODESystem, train: Sequence[Trajectory], delta: float) -> 
 
     def poles(affine: bool) -> Array:
         blocks = samples.blocks(samples.inputs, samples.derivatives)
-        found = fit_linear(blocks, names, LTI(affine=affine)).model.coefficients[0]
-        values = np.linalg.eigvals(np.asarray(found)[:, len(robot.controls) :])
+        fitted = fit_linear(blocks, names, LTI(affine=affine)).model.coefficients[0]
+        values = np.linalg.eigvals(np.asarray(fitted)[:, len(robot.controls) :])
         return np.sort(values.real)[::-1]
 
     return LinearFitAt(delta, poles(True), poles(False))
