@@ -82,7 +82,7 @@ class SolverSettings:
 
 
 def solve_nlp(
-    program: Program, start: Array, options: SolverSettings, multipliers: Array | None = None
+    program: Program, start: Array, settings: SolverSettings, multipliers: Array | None = None
 ) -> Outcome:
     """Minimise a program with IPOPT.
 
@@ -94,10 +94,10 @@ def solve_nlp(
         Functions, derivatives and limits.
     start
         Scaled variables, shape ``(variable,)``.
-    options
+    settings
         See `SolverSettings`.
     multipliers
-        First guess of those of the constraints, with ``options.warm``.
+        First guess of those of the constraints, with ``settings.warm``.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def solve_nlp(
     _require_freedom(program)
     watch = Watch(program)
     with _interruptible(watch), _quiet():
-        solver = make_solver(program, watch, _ipopt(program, options, multipliers is not None))
+        solver = make_solver(program, watch, _ipopt(program, settings, multipliers is not None))
         begin = clock.perf_counter()
         limits = {"lbx": program.lower, "ubx": program.upper}
         limits |= {"lbg": program.g_lower, "ubg": program.g_upper}
@@ -164,7 +164,7 @@ def _ending(word: str) -> str:
     return "failed"
 
 
-def _ipopt(program: Program, options: SolverSettings, multipliers: bool) -> dict[str, Any]:
+def _ipopt(program: Program, settings: SolverSettings, multipliers: bool) -> dict[str, Any]:
     chosen: dict[str, Any] = {
         "no_nlp_grad": True,
         "print_time": False,
@@ -173,14 +173,14 @@ def _ipopt(program: Program, options: SolverSettings, multipliers: bool) -> dict
         "calc_lam_p": False,
         "ipopt.sb": "yes",
         "ipopt.print_level": 0,
-        "ipopt.tol": options.tolerance,
-        "ipopt.constr_viol_tol": options.tolerance,
-        "ipopt.max_iter": options.iterations,
+        "ipopt.tol": settings.tolerance,
+        "ipopt.constr_viol_tol": settings.tolerance,
+        "ipopt.max_iter": settings.iterations,
         # Bounds are met exactly: users rely on them, and a square root on x ≥ 0.
         "ipopt.bound_relax_factor": 0.0,
         "ipopt.mu_strategy": "adaptive" if program.linear_quadratic else "monotone",
     }
-    if options.warm:
+    if settings.warm:
         chosen |= {
             "ipopt.mu_init": 1e-5,
             "ipopt.bound_push": 1e-7,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dfsm.core.progress import track
 from dfsm.data.trajectory import Trajectory
 from dfsm.demos.two_link_robot.assess import Assessed, Rollouts, assess, roll
-from dfsm.demos.two_link_robot.multi_fidelity import choices
+from dfsm.demos.two_link_robot.multi_fidelity import fit_settings
 from dfsm.errors import hushed
 from dfsm.fitting.corrective import CorrectiveSettings
 from dfsm.fitting.corrective.gaussian_process import GP
@@ -77,7 +77,7 @@ def fit_kinds(
     fits = {}
     for name, kind in track(kinds.items(), "corrective functions"):
         with hushed():
-            result = fit(train, choices(robot, kind))
+            result = fit(train, fit_settings(robot, kind))
         seconds = float(sum(result.seconds.values()))
         first = result.model.provenance.record["rows"][0]["decision"]
         fits[name] = Fitted(

@@ -156,12 +156,12 @@ def around(
     )
 
 
-def extraction(size: ExtractionSettings, seed: int) -> Extraction:
+def extraction(settings: ExtractionSettings, seed: int) -> Extraction:
     """Compare the derivative of a cubic spline with the true one (Fig. 1).
 
     Parameters
     ----------
-    size
+    settings
         How much to compute.
     seed
         Seed of the simulations.
@@ -173,28 +173,30 @@ def extraction(size: ExtractionSettings, seed: int) -> Extraction:
     robot = two_link_robot_with_gravity()
 
     def errors(duration: float, runs: int, tolerance: float | None) -> Array:
-        time = np.linspace(0.0, duration, size.points)
+        time = np.linspace(0.0, duration, settings.points)
         runs_around = around(robot, runs, time, DELTA, seed, tolerance)
         return np.mean(
             [np.abs(extracted(r) - robot.derivative(r)).mean(axis=0) for r in runs_around], 0
         )
 
-    mean = errors(DURATION, size.runs, None)
-    durations = [(DURATION, float(mean.mean()), float(errors(DURATION, size.runs, _TIGHT).mean()))]
+    mean = errors(DURATION, settings.runs, None)
+    durations = [
+        (DURATION, float(mean.mean()), float(errors(DURATION, settings.runs, _TIGHT).mean()))
+    ]
     for duration in track(_LONGER, "longer simulations"):
-        loose, tight = (errors(duration, size.longer_runs, t).mean() for t in (None, _TIGHT))
+        loose, tight = (errors(duration, settings.longer_runs, t).mean() for t in (None, _TIGHT))
         durations.append((duration, float(loose), float(tight)))
-    one = around(robot, 1, np.linspace(0.0, _REFINED_DURATION, size.points), DELTA, seed)[0]
-    thin = slice(None, None, -(-size.points // _SHOWN_POINTS))
+    one = around(robot, 1, np.linspace(0.0, _REFINED_DURATION, settings.points), DELTA, seed)[0]
+    thin = slice(None, None, -(-settings.points // _SHOWN_POINTS))
     example = (one.time[thin], robot.derivative(one)[thin], extracted(one)[thin])
     return Extraction(
-        runs=size.runs,
-        points=size.points,
+        runs=settings.runs,
+        points=settings.points,
         mean=float(mean.mean()),
         of_states=mean,
         durations=tuple(durations),
         example=example,
-        refinement=_refine(robot, size, seed),
+        refinement=_refine(robot, settings, seed),
     )
 
 
@@ -204,16 +206,16 @@ def extracted(run: Trajectory) -> Array:
     return np.stack(columns, axis=1)
 
 
-def _refine(robot: ODESystem, size: ExtractionSettings, seed: int) -> Refinement:
+def _refine(robot: ODESystem, settings: ExtractionSettings, seed: int) -> Refinement:
     # Four samples per finest step, so that the truth is known a quarter of the way.
-    time = np.linspace(0.0, _REFINED_DURATION, 4 * size.finest + 1)
+    time = np.linspace(0.0, _REFINED_DURATION, 4 * settings.finest + 1)
     loose, tight = (
-        around(robot, size.refined_runs, time, _REFINED_DELTA, seed, tolerance)
+        around(robot, settings.refined_runs, time, _REFINED_DELTA, seed, tolerance)
         for tolerance in (None, _TIGHTEST)
     )
-    doublings = int(np.log2(size.finest // _COARSEST))
+    doublings = int(np.log2(settings.finest // _COARSEST))
     counts = _COARSEST * 2 ** np.arange(doublings + 1)
-    strides = (4 * size.finest // counts).tolist()
+    strides = (4 * settings.finest // counts).tolist()
     knots, between = np.array([_mesh_errors(robot, tight, n) for n in strides]).T
     usual = [_mesh_errors(robot, loose, n)[0] for n in strides]
     step = _REFINED_DURATION / counts

@@ -164,7 +164,7 @@ def draw(runs: int, duration: float, seed: int) -> list[Trajectory]:
     return two_link_robot().campaign(runs, time, Uniform(low=-1.0, high=1.0), torques, seed=seed)
 
 
-def choices(system: ODESystem, corrective: CorrectiveSettings) -> FitSettings:
+def fit_settings(system: ODESystem, corrective: CorrectiveSettings) -> FitSettings:
     """The defaults of `fit` for a system whose states are all recorded."""
     return FitSettings(
         states=tuple(StateSpec(name=c.name) for c in system.states),
@@ -177,7 +177,7 @@ def choices(system: ODESystem, corrective: CorrectiveSettings) -> FitSettings:
 def recipe(system: ODESystem, samples: int) -> FitSettings:
     """The paper's way."""
     return replace(
-        choices(system, _units(samples)),
+        fit_settings(system, _units(samples)),
         derivatives=DerivativeSettings(method="cubic_spline"),
         nonlinear_only=True,
     )
@@ -188,7 +188,10 @@ def _units(samples: int) -> RBF:
 
 
 def multi_fidelity(
-    train: Sequence[Trajectory], tests: Sequence[Trajectory], size: MultiFidelitySettings, seed: int
+    train: Sequence[Trajectory],
+    tests: Sequence[Trajectory],
+    settings: MultiFidelitySettings,
+    seed: int,
 ) -> MultiFidelity:
     """Fit linear, multi-fidelity and nonlinear-only models and simulate all test runs.
 
@@ -196,7 +199,7 @@ def multi_fidelity(
     ----------
     train, tests
         Runs of the arm without gravity.
-    size
+    settings
         How much to compute.
     seed
         Seed of the simulations of the other arm.
@@ -207,19 +210,19 @@ def multi_fidelity(
     """
     robot = two_link_robot()
     # What JAX compiles in a process that fits for the first time is nobody's build time.
-    _fit(train[:4], recipe(robot, min(size.sweep)))
+    _fit(train[:4], recipe(robot, min(settings.sweep)))
     assessed = {
         n: _compared(_fit(train, recipe(robot, n)), robot, tests)
-        for n in track(sorted({*size.sweep, size.samples}), "subsample sizes")
+        for n in track(sorted({*settings.sweep, settings.samples}), "subsample sizes")
     }
     sweep = Sweep(
-        size.sweep,
-        {m: tuple(assessed[n][m] for n in size.sweep) for m in (LINEAR, MULTI, NONLINEAR)},
+        settings.sweep,
+        {m: tuple(assessed[n][m] for n in settings.sweep) for m in (LINEAR, MULTI, NONLINEAR)},
     )
-    chosen = assessed[size.samples]
-    chaos = _chaos(size.samples, seed) if size.gravity else None
+    chosen = assessed[settings.samples]
+    chaos = _chaos(settings.samples, seed) if settings.gravity else None
     changed = {
-        name: _changed(train, robot, tests, replace(_units(size.samples), **parts))
+        name: _changed(train, robot, tests, replace(_units(settings.samples), **parts))
         for name, parts in _CHANGES.items()
     }
     return MultiFidelity(chosen, _series(chosen, robot, tests, 0), sweep, changed, chaos)
@@ -283,7 +286,7 @@ def _chaos(samples: int, seed: int) -> Chaos:
     )
     train, tests = runs[:TRAINING_RUNS], runs[TRAINING_RUNS:]
     assessed = _compared(_fit(train, recipe(robot, samples)), robot, tests)
-    own = _fit(train, choices(robot, RBF(samples=samples)))
+    own = _fit(train, fit_settings(robot, RBF(samples=samples)))
     assessed[OWN] = assess(own.model, sum(own.seconds.values()), robot, tests)
     steps = round(_SHORT * _RATE)
     pieces = [

@@ -79,12 +79,12 @@ class RobotStudy:
     seconds: float
 
 
-def study(size: StudySettings | None = None, seed: int = 0) -> RobotStudy:
+def study(settings: StudySettings | None = None, seed: int = 0) -> RobotStudy:
     """Run the two-link robot study.
 
     Parameters
     ----------
-    size
+    settings
         How much to compute; None makes the full study, `QUICK` a short one.
     seed
         Seed of everything random.
@@ -99,15 +99,15 @@ def study(size: StudySettings | None = None, seed: int = 0) -> RobotStudy:
         A negative seed.
     """
     require(seed >= 0, "seed", seed, "0 or more")
-    size = size or StudySettings()
+    settings = settings or StudySettings()
     begin = clock.perf_counter()
-    derivatives = extraction(size.extraction, seed)
-    linear = compare_with_taylor(size.taylor, seed)
+    derivatives = extraction(settings.extraction, seed)
+    linear = compare_with_taylor(settings.taylor, seed)
     runs = draw(TRAINING_RUNS + TEST_RUNS, 3.0, seed)
     train, tests = runs[:TRAINING_RUNS], runs[TRAINING_RUNS:]
     long = draw(TEST_RUNS, 5.0, seed + LONG_SEED)
-    nonlinear = multi_fidelity(train, tests, size.multi_fidelity, seed)
-    kinds = fit_kinds(size.kinds, train, tests, long)
+    nonlinear = multi_fidelity(train, tests, settings.multi_fidelity, seed)
+    kinds = fit_kinds(settings.kinds, train, tests, long)
     return RobotStudy(
         derivatives, linear, nonlinear, kinds, seed, seconds=clock.perf_counter() - begin
     )

@@ -105,12 +105,12 @@ class TaylorComparison:
         return np.array([np.abs(poles - which).max() for poles in computed])
 
 
-def compare_with_taylor(size: TaylorSettings, seed: int) -> TaylorComparison:
+def compare_with_taylor(settings: TaylorSettings, seed: int) -> TaylorComparison:
     """Fit linearly near the stationary point, ever nearer, and look at the poles.
 
     Parameters
     ----------
-    size
+    settings
         How much to compute.
     seed
         Seed of the simulations.
@@ -120,18 +120,18 @@ def compare_with_taylor(size: TaylorSettings, seed: int) -> TaylorComparison:
     TaylorComparison
     """
     robot = two_link_robot_with_gravity()
-    time = np.linspace(0.0, DURATION, size.points)
+    time = np.linspace(0.0, DURATION, settings.points)
 
     def runs(delta: float) -> list[Trajectory]:
-        return around(robot, size.runs + 1, time, delta, seed, _TOLERANCE)
+        return around(robot, settings.runs + 1, time, delta, seed, _TOLERANCE)
 
     fits = []
-    for delta in track(size.deltas, "linear fits"):
+    for delta in track(settings.deltas, "linear fits"):
         fits.append(_linear_fit(robot, runs(delta)[:-1], delta))
-    *train, test = runs(size.deltas[0])
+    *train, test = runs(settings.deltas[0])
     with hushed():
         fitted = fit(train, _settings(robot))
-    thin = slice(None, None, -(-size.points // _SHOWN_POINTS))
+    thin = slice(None, None, -(-settings.points // _SHOWN_POINTS))
     truth, linear = robot.derivative(test), slope(fitted.model.linear_fit(), test)
     example = tuple(a[thin] for a in (test.time, truth, linear, _taylor(robot, test)))
     return TaylorComparison(
@@ -139,7 +139,7 @@ def compare_with_taylor(size: TaylorSettings, seed: int) -> TaylorComparison:
         unforced=robot.eigenvalues(STATES, (0.0, 0.0)).real,
         fits=tuple(fits),
         decisions=tuple(fitted.model.provenance.record["rows"]),
-        samples=size.runs * size.points,
+        samples=settings.runs * settings.points,
         seconds=fitted.seconds["linear fit"],
         example=example,  # pyright: ignore[reportArgumentType]
     )
@@ -156,8 +156,8 @@ def _settings(robot: ODESystem) -> FitSettings:
 
 
 def _linear_fit(robot: ODESystem, train: Sequence[Trajectory], delta: float) -> LinearFitAt:
-    choices = _settings(robot)
-    samples = extract(select(train, choices), choices)
+    settings = _settings(robot)
+    samples = extract(select(train, settings), settings)
     names = [c.name for c in samples.signals.inputs]
 
     def poles(affine: bool) -> Array:
