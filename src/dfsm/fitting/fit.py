@@ -169,16 +169,16 @@ def fit(
 
 def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     """Linear fit of ξ̇; kinematic rows d q = q̇ are written down, not fitted."""
-    known = kinematic_rows(settings.states)
-    fitted = [i for i in range(samples.derivatives.shape[1]) if i not in known]
-    given = _given(samples, settings, fitted)
-    result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], settings, given)
+    kinematic = kinematic_rows(settings.states)
+    fitted = [i for i in range(samples.derivatives.shape[1]) if i not in kinematic]
+    known = _known(samples, settings, fitted)
+    result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], settings, known)
     n_uw = len(settings.controls) + len(settings.driving)
     if settings.linear.margin is not None:
         columns = slice(n_uw, n_uw + samples.derivatives.shape[1])
         before = result.residual_rms
         result, moved = stabilise(
-            result, columns, known, settings.linear.margin, settings.linear.affine
+            result, columns, kinematic, settings.linear.margin, settings.linear.affine
         )
         names = [samples.derivative_names[i][0] for i in fitted]
         result = replace(
@@ -190,7 +190,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     L[:, fitted], b[:, fitted] = result.model.coefficients, result.model.offsets
     rms, std = np.zeros(L.shape[1]), samples.derivatives.std(axis=0)
     rms[fitted] = result.residual_rms
-    for row, rate in known.items():
+    for row, rate in kinematic.items():
         L[:, row, n_uw + rate] = 1.0
     model = LinearModel(
         result.model.grid,
@@ -202,7 +202,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     return replace(result, model=model, residual_rms=rms, target_std=std)
 
 
-def _given(
+def _known(
     samples: Samples, settings: FitSettings, fitted: Sequence[int]
 ) -> dict[tuple[int, int], float]:
     """``linear.known`` by fitted row and input column."""
@@ -210,7 +210,7 @@ def _given(
     rates = kinematic_rows(settings.states)
     rows = {spec.name: rates.get(i, i) for i, spec in enumerate(settings.states)}
     inputs = [c.name for c in s.inputs]
-    found = {}
+    known = {}
     for state, coefficients in settings.linear.known.items():
         if state not in rows:
             raise DfsmError(
@@ -222,8 +222,8 @@ def _given(
                     f"linear.known.{state} names '{name}', which is no input of the model; "
                     + near_matches(name, inputs)
                 )
-            found[list(fitted).index(rows[state]), inputs.index(name)] = float(value)
-    return found
+            known[list(fitted).index(rows[state]), inputs.index(name)] = float(value)
+    return known
 
 
 def _account(

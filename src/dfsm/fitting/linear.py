@@ -50,7 +50,7 @@ class LTI:
         Fit an offset (centred regression). False is the paper's ``L = Ẋ Iᵀ (I Iᵀ)⁻¹``.
     margin
         If set, eigenvalues of A with a real part above ``-margin`` (1/s) are moved there, see
-        `stabilise`. Never for a system that is truly unstable.
+        `stabilise`: stability with the schedule frozen. Never for a system that is truly unstable.
     known
         Coefficients that physics gives, by state and by input, in the units of the channels:
         ``{"GenSpeed": {"GenTq": -2.997e-5}}`` says that 1 kN m slows the rotor by 2.997e-5 rpm/s.

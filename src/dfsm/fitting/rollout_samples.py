@@ -40,11 +40,11 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
     # Its outputs are what is going to be fitted.
     model = replace(model, signals=replace(model.signals, outputs=()))
     with hushed():
-        found = simulate(model, list(data), start=settings.start, stop=settings.stop)
+        rollouts = simulate(model, list(data), start=settings.start, stop=settings.stop)
     inputs = samples.inputs.copy()
     names = model.signals.names("states")
     columns = model.signals.state_columns
-    for k, rollout in enumerate(found):
+    for k, rollout in enumerate(rollouts):
         if rollout.status is Status.COMPLETED:
             inputs[samples.runs == k, columns] = rollout.trajectory.select(names).values
     return replace(samples, inputs=inputs)

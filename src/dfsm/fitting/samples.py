@@ -95,7 +95,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
 
 def data_warnings(data: Dataset, settings: FitSettings) -> list[str]:
     """What a user should know about the data before trusting a fit, one sentence each."""
-    found = [text for name in settings.disturbances if (text := wind_warning(name))]
+    warnings = [text for name in settings.disturbances if (text := wind_warning(name))]
     gaps = [
         f"{run.where}: {text}"
         for run in data
@@ -103,8 +103,8 @@ def data_warnings(data: Dataset, settings: FitSettings) -> list[str]:
     ]
     if gaps:
         more = f" ({len(gaps)} of the {len(data)} runs have gaps)" if len(gaps) > 1 else ""
-        found.append(gaps[0] + more)
-    return found
+        warnings.append(gaps[0] + more)
+    return warnings
 
 
 def extract(data: Dataset, settings: FitSettings) -> Samples:
@@ -112,16 +112,16 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
     for run in track(data, "derivatives"):
-        found = differentiate(run, settings.states, settings.derivatives)
-        labels = tuple(zip(found.derivative_names, found.derivative_units, strict=True))
-        whole = found.trajectory
+        extracted = differentiate(run, settings.states, settings.derivatives)
+        labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
+        whole = extracted.trajectory
         inside = whole.window(settings.start, settings.stop)
         rows = np.isin(whole.time, inside.time)
-        names = (*settings.controls, *settings.driving, *found.names, *settings.parameters)
+        names = (*settings.controls, *settings.driving, *extracted.names, *settings.parameters)
         parts.append(
             [
                 inside.select(names).values,
-                found.derivatives[rows],
+                extracted.derivatives[rows],
                 run.select(settings.outputs).values[rows],
                 _harmonics(run, settings.azimuth)[rows],
             ]

@@ -26,7 +26,7 @@ _PLACES = 4
 
 
 def fastest_growth(model: LinearModel, columns: slice) -> float:
-    """Largest real part in 1/s of A's eigenvalues at all schedule values.
+    """Largest real part in 1/s of A's eigenvalues at all schedule values, each frozen.
 
     Parameters
     ----------

@@ -22,8 +22,10 @@ from dfsm.core.types import Array
 _FIRST_DAMPING = 1e-3
 # Gain ratio from which a step is accepted; a model that promises a thousand times too much is none.
 _LEAST_GAIN = 1e-3
-# Damping falls at most by this factor in a step: to a third, Nielsen's choice.
-_LESS = 1 / 3
+# Damping stays where a step gains this share of what was promised, and falls to a third, Nielsen's
+# factor, where it gains that much more. Nielsen's curve stays at a half and falls from nearly all on:
+# it saves refused trials, which cost an error here, where a step costs a JᵀJ.
+_FAIR, _GOOD, _LESS = 0.25, 0.5, 1 / 3
 # Cosine between the residuals and every column of J; step relative to the weights; decrease of the
 # error relative to the error: where one of them is smaller, nothing is left to gain.
 _SMALL_SLOPE, _SMALL_STEP, _SMALL_DECREASE = 1e-8, 1e-8, 1e-9
@@ -112,8 +114,7 @@ class LevenbergMarquardt:
                 return
             if max(trial.promised, here - trial.cost) <= _SMALL_DECREASE * here:
                 self.stop = Stop.DECREASE
-            gain = (here - trial.cost) / trial.promised
-            damping = trial.damping * max(_LESS, 1 - (2 * gain - 1) ** 3)
+            damping = trial.damping * _relief((here - trial.cost) / trial.promised)
             w, here = trial.weights, trial.cost
             yield Step(w, damping)
             if self.stop:
@@ -167,3 +168,8 @@ def _damped_step(curvature: Array, slope: Array, damping: float) -> tuple[Array,
         return None
     change = -cho_solve(factor, slope)
     return change, float(change @ (damping * change - slope))
+
+
+def _relief(gain: float) -> float:
+    """Factor of the damping after a step, continuous in its gain ratio."""
+    return float(_LESS ** min((gain - _FAIR) / _GOOD, 1.0))

@@ -27,8 +27,8 @@ _SHARE = 0.01
 class StabilityKept:
     """What growth adds to a sum of squares; infinite where a model is unstable.
 
-    A linear model must be stable at all schedule values, one with a corrective function at the
-    operating points and between them. A start that is unstable, and meant to be, is left alone.
+    Stable means with the schedule frozen: a linear model must be so at all schedule values, one
+    with a corrective function at the operating points and between them. A start that is unstable, and meant to be, is left alone.
 
     Parameters
     ----------

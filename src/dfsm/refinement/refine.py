@@ -75,7 +75,7 @@ class RefineSettings:
         at 0.8, the difference of two such runs counts five times and their mean about half, see
         `rollout_error.py`, and both are held out or neither is. 0 takes all runs as unrelated.
     weights
-        Weight of a state's squared error, by name; 1 where nothing is given.
+        Weight of a state's squared error, by name; 1 for all others.
     seconds
         No further step is begun after this time; None sets no limit.
     """
@@ -119,7 +119,7 @@ class RefineResult:
     Attributes
     ----------
     model
-        The refined model, or the one given where refinement did not help.
+        The refined model, or its start where refinement did not help.
     improved
         Whether it is the refined one.
     before, after
@@ -162,8 +162,8 @@ def refine(
     ----------
     model
         Where to start: all coefficients of its derivative function may change, linear and
-        corrective ones and the dynamics of latent states; kinematic rows, coefficients that
-        physics gave, and outputs stay.
+        corrective ones and the dynamics of latent states; kinematic rows, coefficients known from
+        physics, and outputs stay.
     runs
         Training runs; some of them are held out to decide when to stop.
     settings
@@ -177,7 +177,8 @@ def refine(
     -------
     RefineResult
         A refined model was not worse on the runs held out than its start before it learnt from
-        them, and is stable at all schedule values if its start is.
+        them. It is stable at all schedule values if its start is, with the schedule frozen; `fit`
+        also looks along recorded paths.
 
     Raises
     ------
@@ -187,7 +188,7 @@ def refine(
     Warns
     -----
     DfsmWarning
-        Refinement did not help and the model given is returned.
+        Refinement did not help and its start is returned.
     """
     settings = settings or RefineSettings()
     data, common = Dataset(runs), ()

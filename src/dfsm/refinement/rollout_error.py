@@ -67,11 +67,11 @@ class Record:
     inputs: Array
     rest: Array
 
-    def follow(self, found: Poles) -> Array:
+    def follow(self, filters: Poles) -> Array:
         """Latent pairs from the start of the record on, complex, ``(before + step + 1, pair)``."""
         h = jnp.full(len(self.inputs) // 2, self.step)
         v = jnp.asarray(self.inputs[::2, : len(self.rest)])
-        return np.asarray(evolve(found, h, v, jnp.asarray(self.rest)))
+        return np.asarray(evolve(filters, h, v, jnp.asarray(self.rest)))
 
     def latent_states(self, model: DFSM) -> Array:
         """A model's latent states from the first state on, ``(step + 1, latent)``."""
@@ -104,7 +104,7 @@ def record_of(
     """
     s = model.signals
     run = with_computed(run, s.hub_height, s.features)
-    found = differentiate(run, s.specs, s.derivatives)
+    extracted = differentiate(run, s.specs, s.derivatives)
     window = run.window(start, stop)
     count = int(window.duration / step * (1 + 1e-9))
     before = int((window.time[0] - run.time[0]) / step * (1 + 1e-9))
@@ -115,9 +115,9 @@ def record_of(
         np.interp(mesh, run.time, moving_average(run.time, run[n], step) if dense else run[n])
         for n in s.exogenous
     ]
-    states = found.trajectory.select(found.names)
+    states = extracted.trajectory.select(extracted.names)
     at = mesh[2 * before :: 2]
-    slopes = [np.interp(at, run.time, d) for d in found.derivatives.T]
+    slopes = [np.interp(at, run.time, d) for d in extracted.derivatives.T]
     return Record(
         step,
         before,

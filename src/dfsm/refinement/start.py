@@ -74,15 +74,15 @@ def start_latents(
         drives[k, columns] = best * decay[k] / std[columns]
     paths = np.concatenate([r.follow(_poles(decay, drives, middle)) for r in records])
     drives /= np.sqrt(np.mean(np.abs(paths) ** 2, axis=0) / 2)[:, None]
-    found = _poles(decay, drives, middle)
-    pairs_along = [r.follow(found)[r.before :] for r in records]
+    dynamics = _poles(decay, drives, middle)
+    pairs_along = [r.follow(dynamics)[r.before :] for r in records]
     c = _regress(np.concatenate(pairs_along), left)
     coupling = np.zeros((len(s.states), count))
     # Re(c ζ) in terms of the real states Re ζ and Im ζ.
     both = np.stack([c.real, -c.imag], axis=2).reshape(len(rows), count)
     coupling[rows] = both * spread[rows, None]
     along = [np.asarray(as_states(jnp.asarray(z))) for z in pairs_along]
-    return add_latents(model, found, coupling, along)
+    return add_latents(model, dynamics, coupling, along)
 
 
 def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
@@ -102,7 +102,7 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
     Returns
     -------
     DFSM
-        Predicts what it did before. Inputs whose effect physics gave are hidden from the network.
+        Predicts what it did before. Inputs whose effect is known from physics are hidden from the network.
     """
     rows = Parametrization.of(model, spread).rows
     rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
