@@ -18,7 +18,7 @@ from dfsm.core.types import Array, IntArray
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import poles
 from dfsm.refinement.parameters import Parametrization
-from dfsm.simulation.integrate import clip_range, exogenous_groups, rate
+from dfsm.simulation.integrate import clip_range, rate
 
 # A rollout that leaves the training range this many half-ranges from its middle is cut off there:
 # the error stays finite and still has a slope.
@@ -200,7 +200,7 @@ def _path(
 
     def slope(at: _At, v: jax.Array) -> tuple[_At, jax.Array]:
         x, P = at
-        inputs = model.join(x, *exogenous_groups(model, v))
+        inputs = model.join(x, *model.signals.order.split_exogenous(v))
         grown = M @ P + parameters.latent_slopes(plain, inputs) if P.size else P
         return (rate(model, x, v), grown), inputs
 
