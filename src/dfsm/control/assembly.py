@@ -192,5 +192,4 @@ def _outside(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> floa
 
 def inputs_of(problem: OptimalControlProblem, run: Trajectory) -> Array:
     """All that the plant's functions see, ``(time, input)``."""
-    groups = ("controls", "disturbances", "states", "parameters")
-    return run.select([n for g in groups for n in problem.plant.names(g)]).values
+    return run.select(problem.plant.order.names).values

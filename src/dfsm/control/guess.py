@@ -113,8 +113,7 @@ def _straight(problem: OptimalControlProblem, time: Array, tau: Array) -> tuple[
     plant = problem.plant
     usual = dict.fromkeys((*plant.names("states"), *plant.names("controls")), 0.0)
     if plant.region is not None:
-        names = [n for g in ("controls", "disturbances", "states") for n in plant.names(g)]
-        usual |= dict(zip(names, np.asarray(plant.region.mean), strict=False))
+        usual |= dict(zip(plant.order.names, np.asarray(plant.region.mean), strict=True))
     ends = time[[0, -1]]
     X = []
     for name in plant.names("states"):

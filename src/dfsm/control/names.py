@@ -16,8 +16,8 @@ import dfsm.core.jax_setup  # noqa: F401
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.dfsm import DFSM
+from dfsm.models.inputs import InputOrder
 from dfsm.models.region import Region
-from dfsm.numerics.hats import scheduled
 from dfsm.simulators import ODESystem
 
 # Letter of a group in user functions, and what it holds.
@@ -52,6 +52,11 @@ class Plant:
     def names(self, group: str) -> tuple[str, ...]:
         """Names of one group, e.g. ``names("states")``."""
         return tuple(c.name for c in self.channels[group])
+
+    @property
+    def order(self) -> InputOrder:
+        """Where everything stands in I = [u, w, ξ, p], which `region` is about."""
+        return InputOrder.of(self.names)
 
     def owner(self, name: str) -> str | None:
         """Letter of the group that holds a channel, None if there is none."""
@@ -141,12 +146,11 @@ class Signals:
 
         See `Region.distance_chosen`; 0 without a surrogate.
         """
-        x, u, w, p = self._raw
-        region = self._plant.region
+        region, order = self._plant.region, self._plant.order
         if region is None:
             return jnp.zeros(())
-        groups = [jnp.asarray(g) for g in (u, w, x, p)]
-        return region.distance_chosen(jnp.concatenate(groups), scheduled(region.schedule, groups))
+        groups = [jnp.asarray(g) for g in self._raw]
+        return region.distance_chosen(order.join(*groups), order.element(region.schedule, *groups))
 
     @property
     def y(self) -> Group:

@@ -429,11 +429,13 @@ def _check_region(problem: OptimalControlProblem, time: Array) -> None:
     plant = problem.plant
     if plant.region is None:
         return
-    names = [n for g in ("controls", "disturbances", "states") for n in plant.names(g)]
-    trained = dict(zip(names, np.stack([plant.region.low, plant.region.high], 1), strict=False))
+    trained = np.stack([plant.region.low, plant.region.high], axis=1)
     for key in problem.bounds:
-        if key in trained:
-            (below, above), (low, high) = problem.limits(key, time), trained[key]
+        if key in plant.order.names:
+            (below, above), (low, high) = (
+                problem.limits(key, time),
+                trained[plant.order.column(key)],
+            )
             if (below > high).any() or (above < low).any():
                 at = int(np.argmax((below > high) | (above < low)))
                 raise DfsmError(

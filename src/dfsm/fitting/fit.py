@@ -173,9 +173,8 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     fitted = [i for i in range(samples.derivatives.shape[1]) if i not in kinematic]
     known = _known(samples, settings, fitted)
     result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], settings, known)
-    n_uw = len(settings.controls) + len(settings.driving)
+    columns = samples.signals.state_columns
     if settings.linear.margin is not None:
-        columns = slice(n_uw, n_uw + samples.derivatives.shape[1])
         before = result.residual_rms
         result, moved = stabilise(
             result, columns, kinematic, settings.linear.margin, settings.linear.affine
@@ -191,7 +190,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     rms, std = np.zeros(L.shape[1]), samples.derivatives.std(axis=0)
     rms[fitted] = result.residual_rms
     for row, rate in kinematic.items():
-        L[:, row, n_uw + rate] = 1.0
+        L[:, row, columns.start + rate] = 1.0
     model = LinearModel(
         result.model.grid,
         jnp.asarray(L),

@@ -21,6 +21,7 @@ from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
 from dfsm.fitting.settings import FitSettings
+from dfsm.models.inputs import InputOrder
 from dfsm.models.signals import (
     Azimuth,
     SignalTable,
@@ -117,10 +118,12 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         whole = extracted.trajectory
         inside = whole.window(settings.start, settings.stop)
         rows = np.isin(whole.time, inside.time)
-        names = (*settings.controls, *settings.driving, *extracted.names, *settings.parameters)
+        order = InputOrder(
+            settings.controls, settings.driving, extracted.names, settings.parameters
+        )
         parts.append(
             [
-                inside.select(names).values,
+                inside.select(order.names).values,
                 extracted.derivatives[rows],
                 run.select(settings.outputs).values[rows],
                 _harmonics(run, settings.azimuth)[rows],

@@ -34,7 +34,7 @@ from dfsm.numerics.filters import moving_average
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.slopes import FAR, sensitivities, spread_steps
-from dfsm.simulation.integrate import exogenous_groups, rk4
+from dfsm.simulation.integrate import rk4
 
 # JᵀJ is summed over the middle one of every four steps, and over more where windows have few:
 # products of the matrices of slopes would be most of the time. Jᵀr is exact.
@@ -81,7 +81,8 @@ class Record:
     def left_over(self, model: DFSM) -> Array:
         """Recorded minus modelled derivatives of the observed states, ``(step + 1, state)``."""
         states = np.concatenate([self.states, self.latent_states(model)], axis=1)
-        exogenous = exogenous_groups(model, jnp.asarray(self.inputs[2 * self.before :: 2]))
+        inputs = jnp.asarray(self.inputs[2 * self.before :: 2])
+        exogenous = model.signals.order.split_exogenous(inputs)
         modelled = np.asarray(model.derivative(states, *exogenous))
         return self.slopes - modelled[:, : self.slopes.shape[1]]
 

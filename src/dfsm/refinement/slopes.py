@@ -19,7 +19,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import poles
 from dfsm.numerics.runge_kutta import rk4_step
 from dfsm.refinement.parameters import Parametrization
-from dfsm.simulation.integrate import clip_range, exogenous_groups, rate
+from dfsm.simulation.integrate import clip_range, rate
 
 # A rollout that leaves the training range this many half-ranges from its middle is cut off there:
 # the error stays finite and still has a slope.
@@ -200,7 +200,7 @@ def _path(
     M = M.T.reshape(-1, 2, 2)
 
     def inputs(x: jax.Array, v: jax.Array) -> jax.Array:
-        return model.join(x, *exogenous_groups(model, v))
+        return model.join(x, *model.signals.order.split_exogenous(v))
 
     def slope(at: _At, v: jax.Array) -> _At:
         x, P = at

@@ -53,22 +53,21 @@ def start_latents(
         Each pair moves by about one standard deviation.
     """
     s, region = model.signals, model.region
-    pairs, n_uw = count // 2, len(s.driving)
+    pairs, driving = count // 2, s.order.driving_columns
     longest = max((len(r.states) - 1) * r.step for r in records)
     decay = np.geomspace(_SLOWEST / longest, 1 / (_FASTEST * records[0].step), pairs)
     rows = list(Parametrization.of(model, spread).rows)
     left = np.concatenate([r.left_over(model)[:, rows] / spread[rows] for r in records])
 
-    std = np.asarray(region.scale)[:n_uw]
-    names = [c.name for c in s.inputs[:n_uw]]
-    columns = [i for i, n in enumerate(names) if drivers is None or n in drivers]
+    std = np.asarray(region.scale)[driving]
+    columns = [i for i, n in enumerate(s.driving) if drivers is None or n in drivers]
     each = np.repeat(decay, len(columns))
     drive = np.tile(np.diag(1 / std)[columns], (pairs, 1)) * each[:, None]
-    middle = np.asarray(region.mean)[:n_uw]
+    middle = np.asarray(region.mean)[driving]
     filters = _poles(each, drive, middle)
     filtered = np.concatenate([r.follow(filters)[r.before :] for r in records])
     coefficients = _regress(filtered, left).reshape(len(rows), pairs, len(columns))
-    drives = np.zeros((pairs, n_uw), dtype=complex)
+    drives = np.zeros((pairs, len(s.driving)), dtype=complex)
     for k in range(pairs):
         best = np.linalg.svd(coefficients[:, k], full_matrices=False)[2][0]
         drives[k, columns] = best * decay[k] / std[columns]

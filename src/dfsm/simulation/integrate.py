@@ -288,15 +288,9 @@ def clip_range(model: DFSM, bound: float) -> tuple[jax.Array, jax.Array]:
     return middle - reach, middle + reach
 
 
-def exogenous_groups(model: DFSM, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Controls, disturbances and parameters in a vector of exogenous inputs."""
-    n_u, n_w = len(model.signals.controls), len(model.signals.disturbances)
-    return v[..., :n_u], v[..., n_u : n_u + n_w], v[..., n_u + n_w :]
-
-
 def rate(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
     """f̂ at states ``(state,)`` and exogenous inputs ``(exogenous,)``."""
-    return model.derivative(x, *exogenous_groups(model, v))
+    return model.derivative(x, *model.signals.order.split_exogenous(v))
 
 
 def _observe(
@@ -311,7 +305,7 @@ def _observe(
         omega = turn[1] * xs[..., turn[0]]
         angle = jnp.cumsum(0.5 * h * (omega[..., 1:] + omega[..., :-1]), axis=-1)
         psi = psi0[..., None] + jnp.concatenate([jnp.zeros_like(omega[..., :1]), angle], axis=-1)
-    groups = exogenous_groups(model, v)
+    groups = model.signals.order.split_exogenous(v)
     return model.output(xs, *groups, psi), model.region.outside(model.join(xs, *groups))
 
 

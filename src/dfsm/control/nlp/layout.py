@@ -190,8 +190,7 @@ class Layout:
         # Latent states follow from the inputs; where disturbances drive them there is no choice.
         if not self.stay_inside or region is None or name in self.problem.latents:
             return low, high
-        groups = ("controls", "disturbances", "states", "parameters")
-        i = [n for g in groups for n in self.problem.plant.names(g)].index(name)
+        i = self.problem.plant.order.column(name)
         low = np.maximum(low, float(region.low[i]))
         high = np.minimum(high, float(region.high[i]))
         if (low > high).any():
@@ -227,8 +226,7 @@ class Layout:
             return float(half)
         region = self.problem.plant.region
         if region is not None:
-            groups = ("controls", "disturbances", "states", "parameters")
-            i = [n for g in groups for n in self.problem.plant.names(g)].index(name)
+            i = self.problem.plant.order.column(name)
             spread = float(region.high[i] - region.low[i]) / 2
             if spread > 0:
                 return spread
