@@ -6,6 +6,7 @@ import copy
 import ctypes
 import gc
 import importlib.util
+import os
 import resource
 import signal
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
@@ -42,6 +44,19 @@ LONG = (
     *("test_results", "test_parameter_study", "test_studies", "test_turbine_control"),
     *("test_latents", "test_adaptive", "test_refine", "test_control_problems"),
 )
+
+# What was compiled for one worker, for a process that a test starts, or in an earlier run, is not
+# compiled again.
+COMPILED = {
+    "JAX_COMPILATION_CACHE_DIR": str(Path(__file__).parents[1] / ".pytest_cache" / "compiled"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0.0,
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": -1,
+}
+for name, value in COMPILED.items():
+    if name not in os.environ:
+        os.environ[name] = str(value)
+        # JAX has read its environment.
+        jax.config.update(name.lower(), value)
 
 # A job in the background may have been told to ignore Ctrl-C, and would hand that on to commands
 # whose reaction to it is tested.
@@ -86,8 +101,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def compiled_code_ends_with_its_file() -> Iterator[None]:
     """Drop what JAX compiled for the tests of a file: up to a gigabyte that no other file needs."""
     yield
-    if "jax" in sys.modules:
-        sys.modules["jax"].clear_caches()
+    jax.clear_caches()
     gc.collect()
     # What was freed lies between what is kept, and the C library would not give it back by itself.
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

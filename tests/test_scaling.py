@@ -42,6 +42,7 @@ def test_the_documentation_has_every_kind_and_number_of_inputs(documented):
         assert all(len(row) == len(head) for row in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [scaling.LINEAR, *CHEAP])
 def test_two_masses_have_the_errors_of_the_documentation(documented, smallest, kind):
     cell = next(row for row in documented if row[0] == kind)[1]

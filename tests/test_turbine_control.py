@@ -36,6 +36,8 @@ from turbine_problem import (
     turbine_case,
 )
 
+pytestmark = pytest.mark.slow
+
 SIZE = ControlStudySettings(points=200, pitch_limits=(5.0, 7.0))
 
 
