@@ -105,3 +105,13 @@ def test_ci_covers_every_python_that_the_package_names():
     matrix = from_yaml(".github/workflows/ci.yml")["jobs"]["test"]["strategy"]["matrix"]
     assert matrix["python"] == named
     assert project["requires-python"] == f">={named[0]}"
+
+
+def test_contributing_names_files_that_exist():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    paths = re.findall(r"`((?:src|tests|docs|benchmarks)/[\w./]+)`", text)
+    assert len(paths) > 8
+    assert [p for p in paths if not (ROOT / p).exists()] == []
+    targets = re.findall(r"^    make (\w+)", text, re.MULTILINE)
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert [t for t in targets if f"\n{t}:" not in makefile] == []
