@@ -58,6 +58,9 @@ for name, value in COMPILED.items():
         # JAX has read its environment.
         jax.config.update(name.lower(), value)
 
+# Bytes that a process may take on before it drops what was compiled.
+MOST_COMPILED = 500_000_000
+
 # A job in the background may have been told to ignore Ctrl-C, and would hand that on to commands
 # whose reaction to it is tested.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -97,16 +100,32 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Peaks())
 
 
-@pytest.fixture(autouse=True, scope="module")
-def compiled_code_ends_with_its_file() -> Iterator[None]:
-    """Drop what JAX compiled for the tests of a file: up to a gigabyte that no other file needs."""
+def resident() -> int:
+    """Bytes of memory that this process has now; 0 where that is not told."""
+    table = Path("/proc/self/statm")
+    pages = int(table.read_text().split()[1]) if table.exists() else 0
+    return pages * resource.getpagesize()
+
+
+@pytest.fixture(autouse=True)
+def compiled_code_is_dropped(kept: list[int]) -> Iterator[None]:
+    """JAX keeps what it compiles for every function and shape: here some gigabytes in an hour."""
     yield
+    if resident() - kept[0] < MOST_COMPILED:
+        return
     jax.clear_caches()
     gc.collect()
     # What was freed lies between what is kept, and the C library would not give it back by itself.
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
+    kept[0] = resident()
+
+
+@pytest.fixture(scope="session")
+def kept() -> list[int]:
+    """Memory in bytes when compiled code was dropped the last time, or at the start."""
+    return [resident()]
 
 
 def example_module(name: str) -> ModuleType:
