@@ -149,7 +149,8 @@ def _change(
     """Cheapest change of the fitted rows of A that moves all eigenvalues left of ``-margin``.
 
     The cost of a change D is what it adds to the residuals, each relative to its variance:
-    ``Σ_r D_r S D_rᵀ / σ_r²``, S being the covariance of the states that the other inputs do not explain.
+    ``Σ_r D_r S D_rᵀ / σ_r²``, S being the covariance of the states
+    that the other inputs do not explain.
     Entries that are not `free`, by fitted row and state, stay.
     Each step solves for the cheapest D that moves the eigenvalues there to first order,
     dλ = wᴴ dA v with the left and right eigenvectors w and v.

@@ -23,8 +23,8 @@ _FIRST_DAMPING = 1e-3
 # Gain ratio from which a step is accepted; a model that promises a thousand times too much is none.
 _LEAST_GAIN = 1e-3
 # Damping stays where a step gains this share of what was promised, and falls to a third, Nielsen's
-# factor, where it gains that much more. Nielsen's curve stays at a half and falls from nearly all on:
-# it saves refused trials, which cost an error here, where a step costs a JᵀJ.
+# factor, where it gains that much more. Nielsen's curve stays at a half and falls from nearly all
+# on: it saves refused trials, which cost an error here, where a step costs a JᵀJ.
 _FAIR, _GOOD, _LESS = 0.25, 0.5, 1 / 3
 # Cosine between the residuals and every column of J; step relative to the weights; decrease of the
 # error relative to the error: where one of them is smaller, nothing is left to gain.

@@ -28,7 +28,8 @@ class StabilityKept:
     """What growth adds to a sum of squares; infinite where a model is unstable.
 
     Stable means with the schedule frozen: a linear model must be so at all schedule values, one
-    with a corrective function at the operating points and between them. A start that is unstable, and meant to be, is left alone.
+    with a corrective function at the operating points and between them. A start that
+    is unstable, and meant to be, is left alone.
 
     Parameters
     ----------

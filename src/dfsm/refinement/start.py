@@ -101,7 +101,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
     Returns
     -------
     DFSM
-        Predicts what it did before. Inputs whose effect is known from physics are hidden from the network.
+        Predicts what it did before. Inputs whose effect is known from physics are
+        hidden from the network.
     """
     rows = Parametrization.of(model, spread).rows
     rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
