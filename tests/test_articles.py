@@ -9,7 +9,7 @@ import pytest
 
 from conftest import Dfsm
 from dfsm.demos.two_link_robot.assess import hushed, roll
-from dfsm.demos.two_link_robot.multi_fidelity import choices, draw
+from dfsm.demos.two_link_robot.multi_fidelity import draw, fit_settings
 from dfsm.fitting.corrective.rbf import RBF
 from dfsm.fitting.fit import fit
 from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table, cell_text
@@ -34,7 +34,7 @@ def test_what_the_command_refuses(tmp_path, dfsm: Dfsm):
 def test_a_rollout_that_ends_early_has_no_rmse():
     runs = draw(6, 1.0, seed=3)
     with hushed():
-        fitted = fit(runs, choices(arm(), RBF(samples=30))).model
+        fitted = fit(runs, fit_settings(arm(), RBF(samples=30))).model
     found = roll(fitted, runs)
     assert found.completed == 6
     assert (found.rmse > 0).all()

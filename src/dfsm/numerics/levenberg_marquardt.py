@@ -25,7 +25,7 @@ _LEAST_GAIN = 1e-3
 # Damping stays where a step gains this share of what was promised, and falls to a third, Nielsen's
 # factor, where it gains that much more. Nielsen's curve stays at a half and falls from nearly all
 # on: it saves refused trials, which cost an error here, where a step costs a JᵀJ.
-_FAIR, _GOOD, _LESS = 0.25, 0.5, 1 / 3
+_FAIR, _GOOD, _LESS, _MORE = 0.25, 0.5, 1 / 3, 4.0
 # Cosine between the residuals and every column of J; step relative to the weights; decrease of the
 # error relative to the error: where one of them is smaller, nothing is left to gain.
 _SMALL_SLOPE, _SMALL_STEP, _SMALL_DECREASE = 1e-8, 1e-8, 1e-9
@@ -83,6 +83,9 @@ class LevenbergMarquardt:
         Weights and damping to start with.
     penalty
         λ.
+    fixed
+        Damping falls to a third after every step that gains a fair share of its promise and grows
+        fourfold where one is refused (Fletcher 1971), instead of going smoothly with the gain.
 
     Attributes
     ----------
@@ -90,8 +93,11 @@ class LevenbergMarquardt:
         Why there is no further step; None until then, and where the caller ended the iteration.
     """
 
-    def __init__(self, problem: LeastSquares, start: Step, penalty: float) -> None:
+    def __init__(
+        self, problem: LeastSquares, start: Step, penalty: float, *, fixed: bool = False
+    ) -> None:
         self._problem, self._start, self._penalty = problem, start, penalty
+        self._fixed = fixed
         self.stop: Stop | None = None
 
     def __iter__(self) -> Iterator[Step]:
@@ -114,7 +120,9 @@ class LevenbergMarquardt:
                 return
             if max(trial.promised, here - trial.cost) <= _SMALL_DECREASE * here:
                 self.stop = Stop.DECREASE
-            damping = trial.damping * _relief((here - trial.cost) / trial.promised)
+            gain = (here - trial.cost) / trial.promised
+            fixed = _LESS if gain >= _FAIR else 1.0
+            damping = trial.damping * (fixed if self._fixed else _relief(gain))
             w, here = trial.weights, trial.cost
             yield Step(w, damping)
             if self.stop:
@@ -124,7 +132,7 @@ class LevenbergMarquardt:
         self, w: Array, here: float, curvature: Array, slope: Array, damping: float
     ) -> _Trial | Stop:
         """The first step that gains enough, under ever more damping, or why there is none."""
-        growth: float = 2.0
+        growth = _MORE if self._fixed else 2.0
         reason: Stop | None = None
         while True:
             step = _damped_step(curvature, slope, damping)
@@ -140,7 +148,7 @@ class LevenbergMarquardt:
                     return _Trial(w + change, there, promised, damping)
                 much = promised > _SMALL_DECREASE * here
                 reason = reason or (Stop.STUCK if much else Stop.DECREASE)
-            damping, growth = damping * growth, 2 * growth
+            damping, growth = damping * growth, growth if self._fixed else 2 * growth
 
     def _cost(self, w: Array) -> float:
         return self._problem.cost(w) + self._penalty * float(w @ w)

@@ -17,6 +17,8 @@ from dfsm.fitting.corrective.training import SEARCH_SAMPLES, CorrectiveFit, Trai
 from dfsm.models.corrective import Perceptron
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 
+# Damping at first: little, so that a start shows soon where it leads.
+_FIRST_DAMPING = 1e-2
 # Steps without progress on the held-out runs after which training stops.
 _PATIENCE = 20
 # Random starts, and steps that each gets to show where it leads.
@@ -105,7 +107,7 @@ def _promising(
     """Best of a few random starts after a few steps each: some lead nowhere."""
     found: list[tuple[float, int, Step]] = []
     for k in range(_STARTS):
-        start = Step(_start(sizes, seed * _STARTS + k))
+        start = Step(_start(sizes, seed * _STARTS + k), _FIRST_DAMPING)
         found.append((error(start), len(found), start))
         for _, step in _steps(sizes, start, train, settings, min(_TRIAL, settings.iterations)):
             found.append((error(step), len(found), step))
@@ -133,5 +135,7 @@ def _steps(
 ) -> Iterator[tuple[int, Step]]:
     """At most `limit` training steps, counted from 1, with a progress bar."""
     problem = NetworkError.of(sizes, data.z, data.targets)
-    steps = LevenbergMarquardt(problem, start, settings.weight_decay * len(data.z))
+    # Measured: fixed factors end in minima that hold better between the samples.
+    penalty = settings.weight_decay * len(data.z)
+    steps = LevenbergMarquardt(problem, start, penalty, fixed=True)
     yield from enumerate(track(islice(steps, limit), "training", limit), start=1)
