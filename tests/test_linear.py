@@ -395,6 +395,16 @@ def test_the_sampling_rate_hardly_matters_to_a_window_that_starves():
     inside = X[:, WIND] >= 10
     own, _ = reference(X[inside], y[inside], True)
     assert abs(found[20][2, 0, 1] - own[0, 1]) > 0.1
-    independent = {rate: f.equations[2].independent[0] for rate, f in fits.items()}
+    independent = {rate: f.equations[2].independent for rate, f in fits.items()}
     assert independent[40] == pytest.approx(independent[10], rel=0.1)
     assert independent[20] < 0.1 * fits[20].samples[2]
+
+
+def test_the_residual_that_remembers_longest_counts_for_all_targets():
+    """White noise in one target must not pass for information where another one remembers."""
+    windows = np.array([[0.0, 10.0], [7.0, 13.0], [10.0, 20.0]])
+    choice, rng = LPV(schedule="wind", points=3), np.random.default_rng(0)
+    slow = starved(20)
+    both = [(X, np.hstack([y, rng.standard_normal(y.shape)])) for X, y in slow]
+    alone = fit_linear(slow, NAMES, choice, windows).equations[2].independent
+    assert fit_linear(both, NAMES, choice, windows).equations[2].independent == alone

@@ -35,11 +35,11 @@ class NormalEquations:
         self.shift = np.asarray(shift, dtype=np.float64)
         self.n_inputs = n_inputs
         self.count = 0
-        self.independent = np.zeros(len(self.shift) - n_inputs)
+        self.independent = 0.0
         self.sums = np.zeros(len(self.shift))
         self.products = np.zeros((len(self.shift), len(self.shift)))
 
-    def add(self, inputs: Array, targets: Array, correlation: Array | float = 1.0) -> None:
+    def add(self, inputs: Array, targets: Array, correlation: float = 1.0) -> None:
         """Add samples.
 
         Parameters
@@ -47,7 +47,7 @@ class NormalEquations:
         inputs, targets
             Shapes ``(sample, input)`` and ``(sample, target)``.
         correlation
-            How many samples of each target count as one, see `correlation_length`.
+            How many samples count as one, see `correlation_length`.
         """
         # Channels as rows: contiguous, so that the product runs at the speed of the memory.
         block = np.empty((len(self.shift), BLOCK))
@@ -60,7 +60,7 @@ class NormalEquations:
             self.products += z @ z.T
             self.sums += z.sum(axis=1)
         self.count += len(inputs)
-        self.independent += len(inputs) / np.asarray(correlation)
+        self.independent += len(inputs) / correlation
 
     def moments(self, centred: bool) -> tuple[Array, Array]:
         """Return the mean, and the mean products about it (about zero if not `centred`)."""
@@ -142,7 +142,7 @@ class NormalEquations:
         Q, right = products[:m, :m], products[:m, m:]
         target_variance = np.maximum(np.diag(products)[m:], np.finfo(float).tiny)
         share = np.minimum(own.residual_variance / target_variance, 1.0)
-        weight = share / np.maximum(self.independent, 1.0)
+        weight = share / max(self.independent, 1.0)
         fixed = np.array(held, dtype=int)
         free = np.delete(np.arange(m), fixed)
         pull = np.diag(prior.input_variance[free])
