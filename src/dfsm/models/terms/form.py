@@ -1,0 +1,93 @@
+"""What every known term φ(u, w, ξ, p) of a linear fit offers to the rest of the package."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.data.trajectory import Channel
+
+
+class Term(eqx.Module):
+    """Some smooth functions of some of the inputs, all in the units of their channels.
+
+    Attributes
+    ----------
+    kind
+        What the form is called in the manifest of a model folder.
+    columns
+        Where the signals that it takes stand in I.
+    channels
+        Name and unit of every value.
+    """
+
+    kind: ClassVar[str]
+    columns: tuple[int, ...] = eqx.field(static=True)
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+
+    # -- evaluation -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def values(self, signals: jax.Array) -> jax.Array:
+        """The values at one sample of the signals, shape ``(signal,)`` to ``(value,)``."""
+
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        """The values at one input vector, shape ``(input,)`` to ``(value,)``."""
+        return self.values(inputs[np.array(self.columns, dtype=int)])
+
+    # -- other terms made of it -----------------------------------------------------------------
+
+    def with_more_inputs(self, at: int, count: int) -> Self:
+        """The same term where I has `count` more inputs from column `at` on."""
+        return replace(self, columns=tuple(c + count if c >= at else c for c in self.columns))
+
+    # -- refinement -----------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> tuple[jax.Array, ...]:
+        """The arrays that refinement on rollouts may change; none unless a term says so."""
+        return ()
+
+    def moved(self, deviations: Sequence[jax.Array]) -> Self:
+        """The term with other parameters; JAX can follow it.
+
+        Parameters
+        ----------
+        deviations
+            Added to `parameters`, shapes as theirs, in units in which 1 is a large change.
+        """
+        return self
+
+    # -- model folders --------------------------------------------------------------------------
+
+    @abstractmethod
+    def structure(self) -> dict[str, Any]:
+        """What a manifest keeps besides `kind`, `columns` and `channels`: JSON values."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, jax.Array]:
+        """What is kept in arrays, by name."""
+
+    @classmethod
+    @abstractmethod
+    def restored(
+        cls,
+        columns: tuple[int, ...],
+        channels: tuple[Channel, ...],
+        arrays: Mapping[str, jax.Array],
+        structure: Mapping[str, Any],
+    ) -> Self:
+        """The term of which `arrays` and `structure` came.
+
+        Raises
+        ------
+        KeyError
+            One of them is missing.
+        """
