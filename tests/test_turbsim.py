@@ -11,8 +11,9 @@ import pytest
 from conftest import Dfsm
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
-from dfsm.data.readers.turbsim import disk_wind, read_turbsim, with_field_wind
+from dfsm.data.readers.turbsim import read_turbsim
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind_field import disk_wind, with_field_wind
 from dfsm.errors import DfsmError
 
 RADIUS, HUB, DY, NY, NZ, COUNT, DT = 50.0, 90.0, 10.0, 13, 14, 40, 0.5
@@ -135,7 +136,8 @@ def test_a_file_too_short_for_a_header(tmp_path):
 def test_the_command_adds_the_wind_to_runs(tmp_path, dfsm: Dfsm):
     field = field_file(tmp_path / "f.bts")
     write_table(run_until(5.0), tmp_path / "run.csv")
-    result = dfsm("wind", field, tmp_path / "run.csv", "--radius", RADIUS, "-o", tmp_path / "new")
+    arguments = (field, tmp_path / "run.csv", "--radius", RADIUS, "-o", tmp_path / "new")
+    result = dfsm("wind", *arguments, "--harmonics", 0)
     assert result.code == 0
     found = read(tmp_path / "new" / "run.parquet")
     assert found.names == ("q", "RotWind", "RotShearV", "RotShearH")

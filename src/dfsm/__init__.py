@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from dfsm.data.info import describe
     from dfsm.data.readers import read, read_all
     from dfsm.data.readers.tables import write_table
-    from dfsm.data.readers.turbsim import read_turbsim, with_field_wind
+    from dfsm.data.readers.turbsim import read_turbsim
     from dfsm.data.trajectory import Channel, Trajectory
+    from dfsm.data.wind_field import with_field_wind
     from dfsm.errors import DfsmError, DfsmWarning
     from dfsm.exports.rosco import RoscoInput, write_rosco
     from dfsm.fitting.corrective import NoCorrection
@@ -79,7 +80,7 @@ _HOME = {
     "write_table": "data.readers.tables",
     "describe": "data.info",
     "read_turbsim": "data.readers.turbsim",
-    "with_field_wind": "data.readers.turbsim",
+    "with_field_wind": "data.wind_field",
     "RandomKnots": "simulators.excitation",
     "RandomSteps": "simulators.excitation",
     "Multisine": "simulators.excitation",

@@ -19,6 +19,7 @@ from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
 from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
+from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
 
@@ -40,6 +41,7 @@ app.command()(optimize)
 app.command("export-rosco")(export_rosco)
 app.command("check-run")(check_run)
 app.command()(calibrate)
+app.command()(wind)
 
 IntervalFile = Annotated[
     Path | None, typer.Option("--intervals", help="Prediction intervals made by dfsm calibrate.")
@@ -282,33 +284,6 @@ def simulate(
     else:
         say(f"wrote {output} ({len(result.trajectory)} samples): {result.message}", quiet)
     _exit_if_ended([result], quiet or as_json)
-
-
-@app.command()
-def wind(
-    field: Annotated[Path, typer.Argument(help="TurbSim field (.bts) that drove the runs.")],
-    files: Files,
-    radius: Annotated[float, typer.Option(help="Rotor radius in m.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the new files.")],
-    quiet: Quiet = False,
-) -> None:
-    """Add the wind over the rotor disk and its slopes to runs: the disturbances to fit with."""
-    from dfsm.core.files import check_file
-    from dfsm.data.readers import read_all
-    from dfsm.data.readers.tables import write_table
-    from dfsm.data.readers.turbsim import read_turbsim, with_field_wind
-
-    source = read_turbsim(field)
-    with working(quiet):
-        runs = read_all(files)
-        output.mkdir(parents=True, exist_ok=True)
-        targets = [output / f"{run.name}.parquet" for run in runs]
-        for target in targets:
-            check_file(target, [run.source for run in runs])
-        added = [with_field_wind(run, source, radius) for run in runs]
-    for run, target in zip(added, targets, strict=True):
-        write_table(run, target)
-        say(f"wrote {target} with RotWind, RotShearV and RotShearH", quiet)
 
 
 @demos.command("two-link-robot")

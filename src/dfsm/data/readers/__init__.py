@@ -14,9 +14,10 @@ from dfsm.core.progress import track
 from dfsm.data.info import ChannelInfo, RunInfo, describe, gap_warning
 from dfsm.data.readers.openfast import read_openfast
 from dfsm.data.readers.tables import read_table, write_table
-from dfsm.data.readers.turbsim import WindField, disk_wind, read_turbsim, with_field_wind
+from dfsm.data.readers.turbsim import read_turbsim
 from dfsm.data.trajectory import Trajectory
 from dfsm.data.wind import undisturbed_rotor_wind, wind_warning
+from dfsm.data.wind_field import WindField, disk_wind, with_field_wind
 from dfsm.errors import DfsmError
 
 __all__ = [

@@ -49,8 +49,9 @@ def read_parquet(path: Path) -> Trajectory:
         ) from error
     schema = _texts(table.schema.metadata)
     units = _pandas_units(schema)
-    channels = [_channel(path, table.schema.field(i), units) for i in range(table.num_columns)]
-    columns = [_column(path, table, i) for i in range(table.num_columns)]
+    fields = [_with_shared(path, field, schema) for field in table.schema]
+    channels = [_channel(path, field, units) for field in fields]
+    columns = [_column(path, table, i, field) for i, field in enumerate(fields)]
     if "dfsm.time_start" in schema:
         at, start = None, _number(path, schema, "dfsm.time_start")
         time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
@@ -174,10 +175,23 @@ def _channel(path: Path, field: pa.Field, units: Mapping[str, str]) -> Channel:
     return Channel(name, unit, step, role)
 
 
-def _column(path: Path, table: pa.Table, index: int) -> Array:
+def _with_shared(path: Path, field: pa.Field, schema: Mapping[str, str]) -> pa.Field:
+    """A column of integers with the unit and step that its file states once for all of them."""
     import pyarrow as pa
 
-    field = table.schema.field(index)
+    known = _texts(field.metadata)
+    if not (pa.types.is_integer(field.type) and {"unit", "scale"} <= schema.keys()) or known:
+        return field
+    step = _number(path, schema, "scale")
+    if not step > 0:
+        raise DfsmError(f"{path}: its metadata give a scale of {step:g}: write the file again")
+    shared = {"unit": schema["unit"], "step": repr(step), "scale": repr(1 / step), "offset": "0"}
+    return field.with_metadata(shared)
+
+
+def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
+    import pyarrow as pa
+
     kind = field.type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
         raise DfsmError(

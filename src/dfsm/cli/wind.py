@@ -1,0 +1,112 @@
+"""The command that turns wind fields into disturbances; `cli` puts it beside the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dfsm.cli.terminal import Files, Quiet, say, working
+from dfsm.errors import DfsmError
+
+if TYPE_CHECKING:
+    from dfsm.data.wind_field import WindField
+
+Box = tuple[int, int, int, float, float, float]
+
+
+def wind(
+    field: Annotated[
+        Path, typer.Argument(help="Field that drove the runs: TurbSim (.bts), or u of a Mann box.")
+    ],
+    files: Files,
+    radius: Annotated[float, typer.Option(help="Rotor radius in m.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the new files.")],
+    harmonics: Annotated[
+        int, typer.Option(help="Highest azimuthal harmonic over rings; 0 for none.")
+    ] = 4,
+    rings: Annotated[
+        str | None,
+        typer.Option(help="Radii of the rings in m, as 36,78,116; default six over the rotor."),
+    ] = None,
+    box: Annotated[
+        Box | None,
+        typer.Option(
+            metavar="NX NY NZ DX DY DZ",
+            help="The field is a Mann box: numbers of points and spacings in m along x, y, z.",
+        ),
+    ] = None,
+    mean_wind: Annotated[
+        float | None, typer.Option(help="Mann box: mean wind in m/s at hub height.")
+    ] = None,
+    hub_height: Annotated[
+        float | None, typer.Option(help="Mann box: height of hub and box in m.")
+    ] = None,
+    shear: Annotated[
+        float | None, typer.Option(help="Mann box: exponent of the mean wind's power law.")
+    ] = None,
+    scale: Annotated[float | None, typer.Option(help="Mann box: factor of its turbulence.")] = None,
+    last_first: Annotated[
+        bool, typer.Option("--last-first", help="Mann box: its last plane meets the rotor first.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Add the wind over the rotor, its slopes and harmonics to runs: disturbances to fit with."""
+    from dfsm.core.files import check_file
+    from dfsm.data.readers import read_all
+    from dfsm.data.readers.tables import write_table
+    from dfsm.data.wind_field import field_signals, with_signals
+
+    told = {"mean-wind": mean_wind, "hub-height": hub_height, "shear": shear, "scale": scale}
+    radii = None if rings is None else _radii(rings)
+    source = _open(field, box, told, last_first)
+    with working(quiet):
+        runs = read_all(files)
+        output.mkdir(parents=True, exist_ok=True)
+        targets = [output / f"{run.name}.parquet" for run in runs]
+        for target in targets:
+            check_file(target, [run.source for run in runs])
+        signals = field_signals(source, radius, harmonics, radii)
+        added = [with_signals(run, source, signals) for run in runs]
+    more = "RotWind, RotShearV and RotShearH"
+    more += f", and harmonics 1 to {harmonics} over rings" if harmonics else ""
+    for run, target in zip(added, targets, strict=True):
+        write_table(run, target)
+        say(f"wrote {target} with {more}", quiet)
+
+
+def _radii(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise DfsmError(f"--rings is '{text}', expected radii in m as in 36,78,116") from None
+
+
+def _open(
+    path: Path, box: Box | None, told: dict[str, float | None], last_first: bool
+) -> WindField:
+    """Open a field of the format that the options tell."""
+    from dfsm.data.readers.mann import BoxSettings, read_mann
+    from dfsm.data.readers.turbsim import read_turbsim
+
+    names = [f"--{name}" for name, value in told.items() if value is not None]
+    if box is None:
+        names += ["--last-first"] if last_first else []
+        if names:
+            raise DfsmError(f"{names[0]} is for a Mann box: give its sizes with --box, or leave it")
+        return read_turbsim(path)
+    mean_wind, hub_height = told["mean-wind"], told["hub-height"]
+    if mean_wind is None or hub_height is None:
+        lost = "--mean-wind" if mean_wind is None else "--hub-height"
+        raise DfsmError(f"{path}: a Mann box does not tell its {lost[2:]}: give it with {lost}")
+    settings = BoxSettings(
+        points=box[:3],
+        spacing=box[3:],
+        mean_wind=mean_wind,
+        hub_height=hub_height,
+        shear=told["shear"] or 0.0,
+        scale=told["scale"],
+        last_first=last_first,
+    )
+    return read_mann(path, settings)
