@@ -1,4 +1,8 @@
-"""TurbSim full-field wind files (`.bts`)."""
+"""TurbSim full-field wind files (`.bts`).
+
+In OpenFAST, a field is half its width ahead of the rotor at the start, so that a turbine that yaws
+stays in it; one that repeats itself begins at the rotor (InflowWind, ``IfW_TurbSim_Init``).
+"""
 
 from __future__ import annotations
 
@@ -98,7 +102,7 @@ def read_turbsim(path: str | Path) -> TurbSimField:
         hub_height=float(hub),
         mean_wind=float(mean),
         periodic=_FORMATS[kind],
-        delay=float(y[-1] - y[0]) / 2 / mean,
+        delay=0.0 if _FORMATS[kind] else float(y[-1] - y[0]) / 2 / mean,
         slope=scales[0],
         offset=scales[1],
         towers=towers,
