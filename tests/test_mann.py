@@ -103,6 +103,7 @@ def test_harmonics_and_time_of_a_box(tmp_path):
     [
         ({"points": (NX, NY, 1)}, r"box\.points is \(40, 13, 1\), expected at least two each way"),
         ({"spacing": (DX, 0.0, DZ)}, r"box\.spacing is .* expected positive numbers"),
+        ({"spacing": (DX, DY, np.nan)}, r"box\.spacing is .* expected positive numbers"),
         ({"mean_wind": -1.0}, r"box\.mean_wind is -1\.0, expected positive"),
         ({"mean_wind": np.nan}, r"box\.mean_wind is nan"),
         ({"hub_height": 0.0}, r"box\.hub_height is 0\.0"),
@@ -151,9 +152,9 @@ def test_the_command_reads_a_box(tmp_path, dfsm: Dfsm):
     assert result.code == 0, result
     settings = BoxSettings(**TOLD, shear=0.1, scale=2.0, last_first=True)
     expected = with_field_wind(run_until(30.0), read_mann(path, settings), RADIUS, 4)
-    found = read(tmp_path / "new" / "run.parquet")
-    assert found.names == expected.names
-    np.testing.assert_allclose(found.values, expected.values, atol=1e-9)
+    written = read(tmp_path / "new" / "run.parquet")
+    assert written.names == expected.names
+    np.testing.assert_allclose(written.values, expected.values, atol=1e-9)
 
     said = "a Mann box does not tell its hub-height: give it with --hub-height"
     assert said in dfsm(*command, *box, *more).sentence

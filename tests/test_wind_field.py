@@ -57,7 +57,7 @@ def test_harmonics_that_are_known(tmp_path):
     def wind(t, z, y):
         return 10 + np.sin(t) + 0.02 * np.cos(t) * z + 0.01 * t * y + 1e-3 * np.cos(3 * t) * y * z
 
-    found = field_signals(formula(tmp_path, wind), RADIUS, 4, RINGS)
+    signals = field_signals(formula(tmp_path, wind), RADIUS, 4, RINGS)
     for r in RINGS:
         known = {
             "U": 10 + np.sin(T),
@@ -67,28 +67,28 @@ def test_harmonics_that_are_known(tmp_path):
         }
         for part in ("U", *(f"{p}{n}" for n in range(1, 5) for p in "CS")):
             expected = known.get(part, np.zeros(COUNT))
-            np.testing.assert_allclose(found[f"{part}_r{r:03g}"], expected, atol=1e-11)
-    np.testing.assert_allclose(found["hub"], 10 + np.sin(T), atol=1e-11)
+            np.testing.assert_allclose(signals[f"{part}_r{r:03g}"], expected, atol=1e-11)
+    np.testing.assert_allclose(signals["hub"], 10 + np.sin(T), atol=1e-11)
 
 
 def test_harmonics_are_those_of_a_fourier_transform_over_a_ring(tmp_path):
     noise = np.random.default_rng(1).normal(10, 2, (COUNT, 14, 13))
     field = formula(tmp_path, lambda t, z, y: noise)
-    found = field_signals(field, RADIUS, 6, RINGS)
+    signals = field_signals(field, RADIUS, 6, RINGS)
     angle = 2 * np.pi * np.arange(48) / 48
     for r in RINGS:
         grid = RegularGridInterpolator((field.z, field.y), noise.transpose(1, 2, 0))
         around = grid(np.stack([HUB + r * np.cos(angle), r * np.sin(angle)], axis=1))
         spectrum = np.fft.rfft(around, axis=0) / 48
-        np.testing.assert_allclose(found[f"U_r{r:03g}"], spectrum[0].real, rtol=1e-12)
+        np.testing.assert_allclose(signals[f"U_r{r:03g}"], spectrum[0].real, rtol=1e-12)
         for n in range(1, 7):
-            C, S = (found[f"{p}{n}_r{r:03g}"] for p in "CS")
+            C, S = (signals[f"{p}{n}_r{r:03g}"] for p in "CS")
             np.testing.assert_allclose(C - 1j * S, 2 * spectrum[n], atol=1e-12)
     z, y = np.meshgrid(field.z - HUB, field.y, indexing="ij")
     disk = noise[:, np.hypot(y, z) <= RADIUS]
-    np.testing.assert_allclose(found["U_disk"], disk.mean(axis=1), rtol=1e-12)
-    np.testing.assert_allclose(found["U_cubic"] ** 3, (disk**3).mean(axis=1), rtol=1e-12)
-    np.testing.assert_allclose(found.values[:, :3], disk_wind(field, RADIUS), rtol=1e-12)
+    np.testing.assert_allclose(signals["U_disk"], disk.mean(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(signals["U_cubic"] ** 3, (disk**3).mean(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(signals.values[:, :3], disk_wind(field, RADIUS), rtol=1e-12)
 
 
 def test_harmonics_of_a_real_field():
@@ -100,11 +100,11 @@ def test_harmonics_of_a_real_field():
     }
     names = ["U_r015", "C1_r036", "S1_r036", "C2_r078", "S3_r099", "S4_r116", "C4_r116"]
     run = read(REAL.with_suffix(".parquet")).window(0.0, 11.0).select(["GenSpeed"])
-    found = with_field_wind(run, read_turbsim(REAL.with_suffix(".bts")), 120.0, 4)
+    signals = with_field_wind(run, read_turbsim(REAL.with_suffix(".bts")), 120.0, 4)
     for time, expected in known.items():
-        row = found.select([*names, "U_disk", "U_cubic"]).resample([time, time + 0.1]).values[0]
+        row = signals.select([*names, "U_disk", "U_cubic"]).resample([time, time + 0.1]).values[0]
         np.testing.assert_allclose(row, expected, atol=1.5e-3)
-    assert found.channel("C4_r116") == Channel("C4_r116", "m/s", role="disturbance")
+    assert signals.channel("C4_r116") == Channel("C4_r116", "m/s", role="disturbance")
 
 
 def test_names_and_default_rings():
@@ -241,14 +241,14 @@ def test_the_command_adds_harmonics(tmp_path, dfsm: Dfsm):
     assert result.code == 0
     assert "with RotWind, RotShearV and RotShearH, and harmonics 1 to 4 over rings" in result.out
     expected = with_field_wind(run_until(5.0), read_turbsim(field), RADIUS, 4)
-    found = read(tmp_path / "new" / "run.parquet")
-    assert found.names == expected.names
-    np.testing.assert_allclose(found.values, expected.values, atol=1e-12)
+    written = read(tmp_path / "new" / "run.parquet")
+    assert written.names == expected.names
+    np.testing.assert_allclose(written.values, expected.values, atol=1e-12)
     assert dfsm(*command, "--harmonics", 2, "--rings", "12.5,40").code == 0
     expected = with_field_wind(run_until(5.0), read_turbsim(field), RADIUS, 2, (12.5, 40.0))
-    found = read(tmp_path / "new" / "run.parquet")
-    assert found.names == expected.names
-    np.testing.assert_allclose(found.values, expected.values, atol=1e-12)
+    written = read(tmp_path / "new" / "run.parquet")
+    assert written.names == expected.names
+    np.testing.assert_allclose(written.values, expected.values, atol=1e-12)
 
 
 @pytest.mark.parametrize(

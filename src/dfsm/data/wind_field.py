@@ -38,9 +38,9 @@ _AROUND = 48
 BLOCK = 1000
 # A plane has three unknowns; with fewer points than this the disk is not resolved.
 _FEWEST_POINTS = 9
-# Correlations of winds over 600 s in 34 runs of a rotor of 120 m: the same signal of the same field
-# 1.00, of another seed up to 0.77; the hub and the average around 15 m 0.71 to 0.95, other seeds up
-# to 0.60 (the hub and the disk's average overlap with other seeds: 0.41 is the least).
+# Correlations over 600 s between the winds of 34 runs and fields, rotor of 120 m. One signal of a
+# run and its own field: 1.00, another field: 0.77 at most. Hub and average around 15 m: 0.71 at
+# least, another field 0.60 at most. The hub and the average over the disk do not tell: 0.41, 0.63.
 _SAME = 0.9
 _POINT_AND_RING = 0.65
 

@@ -66,11 +66,10 @@ class BoxSettings:
 
     def __post_init__(self) -> None:
         require(min(self.points) >= 2, "box.points", self.points, "at least two each way")
-        positive = {"spacing": min(self.spacing), "mean_wind": self.mean_wind}
-        positive |= {"hub_height": self.hub_height}
-        positive |= {} if self.scale is None else {"scale": self.scale}
-        for name, value in positive.items():
-            require(0 < value < np.inf, f"box.{name}", getattr(self, name), "positive numbers")
+        for name in ("spacing", "mean_wind", "hub_height", "scale"):
+            value = getattr(self, name)
+            positive = value is None or bool(np.all(np.greater(value, 0) & np.isfinite(value)))
+            require(positive, f"box.{name}", value, "positive numbers")
         require(bool(np.isfinite(self.shear)), "box.shear", self.shear, "an exponent such as 0.14")
 
 
