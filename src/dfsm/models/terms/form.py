@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
 
 
@@ -47,6 +48,23 @@ class Term(eqx.Module):
     def with_more_inputs(self, at: int, count: int) -> Self:
         """The same term where I has `count` more inputs from column `at` on."""
         return replace(self, columns=tuple(c + count if c >= at else c for c in self.columns))
+
+    # -- data -----------------------------------------------------------------------------------
+
+    def check(self, values: Mapping[str, Array]) -> list[str]:  # noqa: ARG002
+        """What is doubtful about the signals of the training samples, one sentence each.
+
+        Parameters
+        ----------
+        values
+            Samples by channel name, shape ``(sample,)``; at least those that it takes.
+
+        Raises
+        ------
+        DfsmError
+            They cannot be what the term takes them for.
+        """
+        return []
 
     # -- refinement -----------------------------------------------------------------------------
 
