@@ -73,7 +73,7 @@ class Term(eqx.Module):
         """The arrays that refinement on rollouts may change; none unless a term says so."""
         return ()
 
-    def moved(self, deviations: Sequence[jax.Array]) -> Self:
+    def moved(self, deviations: Sequence[jax.Array]) -> Self:  # noqa: ARG002
         """The term with other parameters; JAX can follow it.
 
         Parameters
