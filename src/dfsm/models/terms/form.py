@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
 
 
@@ -48,6 +49,23 @@ class Term(eqx.Module):
         """The same term where I has `count` more inputs from column `at` on."""
         return replace(self, columns=tuple(c + count if c >= at else c for c in self.columns))
 
+    # -- data -----------------------------------------------------------------------------------
+
+    def check(self, values: Mapping[str, Array]) -> list[str]:  # noqa: ARG002
+        """What is doubtful about the signals of the training samples, one sentence each.
+
+        Parameters
+        ----------
+        values
+            Samples by channel name, shape ``(sample,)``; at least those that it takes.
+
+        Raises
+        ------
+        DfsmError
+            They cannot be what the term takes them for.
+        """
+        return []
+
     # -- refinement -----------------------------------------------------------------------------
 
     @property
@@ -55,7 +73,7 @@ class Term(eqx.Module):
         """The arrays that refinement on rollouts may change; none unless a term says so."""
         return ()
 
-    def moved(self, deviations: Sequence[jax.Array]) -> Self:
+    def moved(self, deviations: Sequence[jax.Array]) -> Self:  # noqa: ARG002
         """The term with other parameters; JAX can follow it.
 
         Parameters
