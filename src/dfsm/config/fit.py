@@ -20,6 +20,7 @@ from dfsm.fitting.corrective import MLP, CorrectiveSettings
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
+from dfsm.models.terms import TermSettings
 from dfsm.refinement.refine import RefineSettings
 from dfsm.selection.compare import HOLD_OUT, check_candidates
 from dfsm.selection.trial import Candidate
@@ -94,6 +95,7 @@ class Config(Strict):
     signals: SignalConfig
     derivatives: DerivativeSettings = DerivativeSettings()
     linear: Annotated[LTI | LPV, Field(discriminator="kind")] = LTI()
+    terms: list[Annotated[TermSettings, Field(discriminator="kind")]] = Field(default_factory=list)
     corrective: Annotated[CorrectiveSettings, Field(discriminator="kind")] = MLP()
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
@@ -117,6 +119,7 @@ class Config(Strict):
             hub_height=self.data.hub_height,
             derivatives=self.derivatives,
             linear=self.linear,
+            terms=tuple(self.terms),
             corrective=self.corrective,
             gate=self.gate,
             azimuth=self.azimuth,

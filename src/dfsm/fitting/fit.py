@@ -24,10 +24,11 @@ from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.trajectory import Trajectory
-from dfsm.errors import DfsmError, DfsmWarning, hushed, near_matches
+from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.gate import correct
+from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
@@ -114,7 +115,7 @@ def fit(
         f = _fit_derivatives(samples, settings)
     with _timed(seconds, "corrective functions"):
         later = refinement is not None and refinement.network > 0
-        e = correct(samples, samples.inputs, samples.derivatives, f, settings, later)
+        e = correct(samples, samples.linear_inputs, samples.derivatives, f, settings, later)
     region = region_of(samples, f.model, data)
     model = DFSM(
         f=f.model,
@@ -125,6 +126,7 @@ def fit(
         corrected=e.rows,
         corrected_outputs=(),
         signals=samples.signals,
+        terms=samples.terms,
     )
     if settings.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
@@ -134,10 +136,11 @@ def fit(
             window = {"start": settings.start, "stop": settings.stop}
             model = refine(model, data, refinement, **window, seed=settings.seed).model
             recorded = with_latents(model, data, samples, settings)
+            recorded = replace(recorded, terms=model.terms)
             seen = along_rollouts(model, data, recorded, settings)
     with _timed(seconds, "outputs"):
         g = _fit_outputs(seen, settings)
-        e_g = correct(seen, _output_inputs(seen), seen.outputs, g, settings) if g else None
+        e_g = correct(seen, seen.output_inputs, seen.outputs, g, settings) if g else None
     model = replace(
         model,
         g=g.model if g else None,
@@ -171,13 +174,16 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     """Linear fit of ξ̇; kinematic rows d q = q̇ are written down, not fitted."""
     kinematic = kinematic_rows(settings.states)
     fitted = [i for i in range(samples.derivatives.shape[1]) if i not in kinematic]
-    known = _known(samples, settings, fitted)
-    result = _linear(samples, samples.inputs, samples.derivatives[:, fitted], settings, known)
+    known = known_coefficients(samples, settings, fitted)
+    inputs, targets = samples.linear_inputs, samples.derivatives[:, fitted]
+    result = _linear(samples, inputs, targets, settings, {**known.first, **known.fixed})
+    result = replace(result, model=replace(result.model, known=tuple(known.fixed)))
     columns = samples.signals.state_columns
     if settings.linear.margin is not None:
         before = result.residual_rms
+        slopes = None if samples.terms is None else _slopes(samples, result)
         result, moved = stabilise(
-            result, columns, kinematic, settings.linear.margin, settings.linear.affine
+            result, columns, kinematic, settings.linear.margin, settings.linear.affine, slopes
         )
         names = [samples.derivative_names[i][0] for i in fitted]
         result = replace(
@@ -199,30 +205,6 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
         tuple((fitted[row], column) for row, column in result.model.known),
     )
     return replace(result, model=model, residual_rms=rms, target_std=std)
-
-
-def _known(
-    samples: Samples, settings: FitSettings, fitted: Sequence[int]
-) -> dict[tuple[int, int], float]:
-    """``linear.known`` by fitted row and input column."""
-    s = samples.signals
-    rates = kinematic_rows(settings.states)
-    rows = {spec.name: rates.get(i, i) for i, spec in enumerate(settings.states)}
-    inputs = [c.name for c in s.inputs]
-    known = {}
-    for state, coefficients in settings.linear.known.items():
-        if state not in rows:
-            raise DfsmError(
-                f"linear.known names '{state}', which is not a state; " + near_matches(state, rows)
-            )
-        for name, value in coefficients.items():
-            if name not in inputs:
-                raise DfsmError(
-                    f"linear.known.{state} names '{name}', which is no input of the model; "
-                    + near_matches(name, inputs)
-                )
-            known[list(fitted).index(rows[state]), inputs.index(name)] = float(value)
-    return known
 
 
 def _account(
@@ -248,11 +230,16 @@ def _account(
 def _fit_outputs(samples: Samples, settings: FitSettings) -> LinearFit | None:
     if not settings.outputs:
         return None
-    return _linear(samples, _output_inputs(samples), samples.outputs, settings)
+    return _linear(samples, samples.output_inputs, samples.outputs, settings)
 
 
-def _output_inputs(samples: Samples) -> Array:
-    return np.concatenate([samples.inputs, samples.harmonics], axis=1)
+def _slopes(samples: Samples, fit: LinearFit) -> Array:
+    """Slopes of the terms in the states at the mean inputs of every schedule point."""
+    terms, n = samples.terms, samples.inputs.shape[1]
+    if terms is None:
+        return np.zeros((len(fit.equations), 0, len(samples.signals.states)))
+    middles = np.stack([e.mean[:n] for e in fit.equations])
+    return terms.slopes(middles)[:, :, samples.signals.state_columns]
 
 
 def _linear(
@@ -262,7 +249,7 @@ def _linear(
     settings: FitSettings,
     known: Mapping[tuple[int, int], float] | None = None,
 ) -> LinearFit:
-    names = [c.name for c in samples.signals.inputs]
+    names = samples.linear_names
     names += ["cos(blades ψ)", "sin(blades ψ)"][: inputs.shape[1] - len(names)]
     windows = None
     if isinstance(settings.linear, LPV):
@@ -293,7 +280,8 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
         return LinearModel(jnp.zeros(1), zero, jnp.asarray(mean)[None], None), trained.function
 
     f, e = part(samples.inputs, samples.derivatives)
-    g, e_g = part(_output_inputs(samples), samples.outputs) if settings.outputs else (None, None)
+    inputs = samples.without_terms(samples.output_inputs)
+    g, e_g = part(inputs, samples.outputs) if settings.outputs else (None, None)
     return DFSM(
         f=f,
         e=e,

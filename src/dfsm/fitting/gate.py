@@ -68,7 +68,8 @@ def correct(
     samples
         All training samples.
     inputs, targets
-        What is fitted on what, shapes ``(sample, input)`` and ``(sample, target)``.
+        What is fitted on what, shapes ``(sample, input)`` and ``(sample, target)``; the corrective
+        function does not take the known terms among the inputs.
     linear
         The linear fit of the targets.
     settings
@@ -86,8 +87,9 @@ def correct(
     derivatives = targets is samples.derivatives
     known = kinematic_rows(settings.states) if derivatives else {}
     large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > settings.gate]
-    hidden, trained = linear.model.known_inputs, None
+    hidden, trained = linear.model.known_among(samples.inputs.shape[1]), None
     if large and not later:
+        inputs = samples.without_terms(inputs)
         trained = _train(inputs, residuals[:, large], hidden, samples.runs, settings)
     function, explained, detail = None, dict[int, float](), ""
     if trained is not None:

@@ -56,11 +56,16 @@ class LTI:
         ``{"GenSpeed": {"GenTq": -2.997e-5}}`` says that 1 kN m slows the rotor by 2.997e-5 rpm/s.
         They enter the highest derivative of the state and are never changed, not for a margin
         either; what corrects the derivatives does not see these inputs.
+    only
+        By state, the inputs that least squares gives its highest derivative, where physics says
+        so; refinement on rollouts may use the others, too. All others are constant along a
+        schedule, for all states.
     """
 
     kind: Literal["LTI"] = "LTI"
     affine: bool = True
     known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    only: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     margin: float | None = None
 
 
@@ -77,8 +82,8 @@ class LPV:
     constant
         Inputs whose coefficients are the same at all points, where physics says so: a torque
         changes a speed by one over the inertia, whatever the wind.
-    known
-        As for `LTI`; these inputs are constant for all states.
+    known, only
+        As for `LTI`; inputs with such a coefficient are constant for all states.
     affine
         Fit an offset in every window.
     margin
@@ -90,6 +95,7 @@ class LPV:
     points: int = 5
     constant: tuple[str, ...] = ()
     known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    only: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     affine: bool = True
     margin: float | None = None
 

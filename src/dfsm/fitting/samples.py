@@ -22,6 +22,7 @@ from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.inputs import InputOrder
+from dfsm.models.terms import Terms, terms_of
 from dfsm.models.signals import (
     Azimuth,
     SignalTable,
@@ -46,6 +47,8 @@ class Samples:
         What the columns mean.
     derivative_names
         Name and unit of each state derivative.
+    terms
+        Known terms of the linear fits.
     """
 
     inputs: Array
@@ -55,6 +58,31 @@ class Samples:
     runs: IntArray
     signals: SignalTable
     derivative_names: tuple[tuple[str, str], ...]
+    terms: Terms | None = None
+
+    @property
+    def linear_inputs(self) -> Array:
+        """[I, φ], what linear fits of derivatives take, ``(sample, input + term)``."""
+        if self.terms is None:
+            return self.inputs
+        return np.concatenate([self.inputs, self.terms.along(self.inputs)], axis=1)
+
+    @property
+    def linear_names(self) -> list[str]:
+        """Names of their columns."""
+        terms = () if self.terms is None else self.terms.channels
+        return [c.name for c in (*self.signals.inputs, *terms)]
+
+    @property
+    def output_inputs(self) -> Array:
+        """[I, φ, harmonics], what linear fits of outputs take."""
+        return np.concatenate([self.linear_inputs, self.harmonics], axis=1)
+
+    def without_terms(self, inputs: Array) -> Array:
+        """What corrective functions take of what linear fits do: all but φ."""
+        n = self.inputs.shape[1]
+        after = n if self.terms is None else n + len(self.terms.channels)
+        return np.concatenate([inputs[:, :n], inputs[:, after:]], axis=1)
 
     def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
         """Samples run by run."""
@@ -131,14 +159,16 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         )
     lengths = [len(p[0]) for p in parts]
     inputs, derivatives, outputs, harmonics = (np.concatenate(c) for c in zip(*parts, strict=True))
+    signals = _signals(data, settings)
     return Samples(
         inputs=inputs,
         derivatives=derivatives,
         outputs=outputs,
         harmonics=harmonics,
         runs=np.repeat(np.arange(len(data)), lengths),
-        signals=_signals(data, settings),
+        signals=signals,
         derivative_names=labels,
+        terms=terms_of(settings.terms, signals.inputs, inputs),
     )
 
 

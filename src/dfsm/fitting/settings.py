@@ -6,19 +6,15 @@ from collections.abc import Iterable
 from dataclasses import field
 
 from dfsm.core.settings import require, settings_class
-from dfsm.data.derivatives import (
-    DerivativeSettings,
-    StateSpec,
-)
+from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
 from dfsm.data.trajectory import Role
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
 from dfsm.fitting.corrective.perceptron import MLP
 from dfsm.fitting.linear import LPV, LTI
-from dfsm.models.signals import (
-    Azimuth,
-)
+from dfsm.models.signals import Azimuth
+from dfsm.models.terms import TermSettings
 
 
 @settings_class
@@ -38,6 +34,9 @@ class FitSettings:
         How derivatives are extracted.
     linear
         `LTI`, or `LPV` in one of the disturbances (or other inputs).
+    terms
+        Known physics inside the linear fits, see `models.terms`: their values are inputs of these
+        like any other, and may be named in ``linear.constant`` and ``linear.known``.
     corrective
         Kind and settings of the corrective functions; None leaves the linear fit alone.
     gate
@@ -70,6 +69,7 @@ class FitSettings:
     azimuth: Azimuth | None = None
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()
+    terms: tuple[TermSettings, ...] = ()
     nonlinear_only: bool = True
     seed: int = 0
 

@@ -30,7 +30,9 @@ _AIM, _FURTHER, _NEAR = 1e-3, 1.03, 100
 _LEAST_VARIANCE = 1e-12
 
 
-def state_matrix(coefficients: Array, columns: slice, known: Mapping[int, int]) -> Array:
+def state_matrix(
+    coefficients: Array, columns: slice, known: Mapping[int, int], slopes: Array | None = None
+) -> Array:
     """A from the coefficients of the fitted rows and the kinematic rows.
 
     Parameters
@@ -41,17 +43,26 @@ def state_matrix(coefficients: Array, columns: slice, known: Mapping[int, int]) 
         Input columns that are states.
     known
         Kinematic rows, see `kinematic_rows`.
+    slopes
+        Of the terms, the last of the inputs, in the states, ``(term, state)``; None without.
     """
     n = columns.stop - columns.start
+    slopes = np.zeros((0, n)) if slopes is None else slopes
     A = np.zeros((n, n))
     for row, rate in known.items():
         A[row, rate] = 1.0
-    A[[i for i in range(n) if i not in known]] = coefficients[:, columns]
+    terms = coefficients[:, coefficients.shape[1] - len(slopes) :]
+    A[[i for i in range(n) if i not in known]] = coefficients[:, columns] + terms @ slopes
     return A
 
 
 def stabilise(
-    fit: LinearFit, columns: slice, known: Mapping[int, int], margin: float, affine: bool
+    fit: LinearFit,
+    columns: slice,
+    known: Mapping[int, int],
+    margin: float,
+    affine: bool,
+    slopes: Array | None = None,
 ) -> tuple[LinearFit, list[float]]:
     """Move eigenvalues right of ``-margin`` onto it, and refit everything else.
 
@@ -75,6 +86,9 @@ def stabilise(
         Largest real part allowed is ``-margin``, in 1/s.
     affine
         Whether the fit has an offset.
+    slopes
+        Of known terms, the last of the inputs, in the states, ``(point, term, state)``; their
+        coefficients stay.
 
     Returns
     -------
@@ -90,9 +104,12 @@ def stabilise(
     if not margin > 0:
         raise DfsmError(f"linear.margin is {margin:g}, expected a positive number of 1/s, or null")
     margins = np.full(len(fit.equations), margin)
+    if slopes is None:
+        slopes = np.zeros((len(fit.equations), 0, columns.stop - columns.start))
     for _ in range(_ROUNDS):
-        stable, moved = _stable_points(fit, columns, known, margins, affine)
-        A = [state_matrix(L, columns, known) for L in np.asarray(stable.model.coefficients)]
+        stable, moved = _stable_points(fit, columns, known, margins, affine, slopes)
+        L = np.asarray(stable.model.coefficients)
+        A = [state_matrix(L_k, columns, known, s) for L_k, s in zip(L, slopes, strict=True)]
         excess = np.array([growth_between(a, b) + margin for a, b in pairwise(A)])
         if (excess <= 0).all():
             return stable, moved
@@ -105,13 +122,20 @@ def stabilise(
 
 
 def _stable_points(
-    fit: LinearFit, columns: slice, known: Mapping[int, int], margins: Array, affine: bool
+    fit: LinearFit,
+    columns: slice,
+    known: Mapping[int, int],
+    margins: Array,
+    affine: bool,
+    slopes: Array,
 ) -> tuple[LinearFit, list[float]]:
     """Every schedule point left of a margin of its own, and the points that had to be moved."""
     n = columns.stop - columns.start
     rows = [i for i in range(n) if i not in known]
     states = range(columns.start, columns.stop)
-    held = [*states, *(c for c in fit.constant if c not in states)]
+    inputs = fit.model.coefficients.shape[2]
+    terms = range(inputs - slopes.shape[1], inputs)
+    held = [*states, *dict.fromkeys([*(c for c in fit.constant if c not in states), *terms])]
     free = np.ones((len(rows), n), dtype=bool)
     for row, column in fit.model.known:
         if column in states:
@@ -121,7 +145,7 @@ def _stable_points(
     variance = np.zeros((len(offsets), offsets.shape[1]))
     moved = []
     for k, (equations, margin) in enumerate(zip(fit.equations, margins, strict=True)):
-        A = state_matrix(coefficients[k], columns, known)
+        A = state_matrix(coefficients[k], columns, known, slopes[k])
         fixed = coefficients[k][:, held]
         variance[k] = equations.complete(held, fixed, affine)[2]
         if np.linalg.eigvals(A).real.max() <= -margin:

@@ -1,9 +1,9 @@
 """DFSM: the surrogate ξ̇ = f̂(ξ, u, w, p) and y = ĝ(ξ, u, w, p) as one immutable JAX pytree.
 
-    f̂(I) = f̂_L(I; s) + e(I)        ĝ(I) = ĝ_L(I; s) + e_g(I)        I = [u, w, ξ, p]
+    f̂(I) = f̂_L(I, φ; s) + e(I)     ĝ(I) = ĝ_L(I, φ; s) + e_g(I)     I = [u, w, ξ, p],  φ = φ(I)
 
-The linear parts are defined for every row; the corrective functions only for the rows that need
-one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `derivative` and
+The linear parts are defined for every row, with known terms φ among their inputs where there are
+any; the corrective functions only for the rows that need one (Sec. 3.1, 3.4, 3.6, 3.7). Everything that evaluates a model goes through `derivative` and
 `output`, so simulation, Jacobians and optimization see the same function.
 """
 
@@ -26,6 +26,7 @@ from dfsm.errors import DfsmError, printable
 from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
+from dfsm.models.terms import Terms
 from dfsm.models.signals import Provenance, SignalTable, blade_harmonics
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ class DFSM(eqx.Module):
         Corrective functions of the derivatives `corrected` and the outputs `corrected_outputs`.
     region
         Where the training data lie.
+    terms
+        Known terms φ, which the linear fits take after I; None without.
     corrected, corrected_outputs
         Row indices that the corrective functions add to.
     signals
@@ -64,6 +67,7 @@ class DFSM(eqx.Module):
     corrected_outputs: tuple[int, ...] = eqx.field(static=True)
     signals: SignalTable = eqx.field(static=True)
     provenance: Provenance = eqx.field(static=True, default_factory=Provenance)
+    terms: Terms | None = None
 
     def __repr__(self) -> str:
         # Without the arrays, which JAX replaces by other things at times.
@@ -234,6 +238,21 @@ class DFSM(eqx.Module):
             outputs=list(names("outputs")),
         )
 
+    def linear_state_matrices(self) -> Array:
+        """A of the linear fit at every schedule point, ``(point, state, state)``.
+
+        Known terms count with their slopes at the middle of the training data there.
+        """
+        columns = self.signals.state_columns
+        L = np.asarray(self.f.coefficients)
+        A = L[:, :, columns]
+        if self.terms is None:
+            return A
+        n, grid = len(self.signals.inputs), np.asarray(self.region.grid)
+        middles = [np.interp(self.f.grid, grid, v) for v in np.asarray(self.region.operating).T]
+        slopes = self.terms.slopes(np.stack(middles, axis=1))[:, :, columns]
+        return A + L[:, :, n:] @ slopes
+
     def eigenvalues(self) -> list[tuple[float, ComplexArray]]:
         """Eigenvalues (1/s) of the linear fit's A at every schedule point.
 
@@ -242,7 +261,7 @@ class DFSM(eqx.Module):
         list
             Pairs of schedule value and complex eigenvalues, most unstable first.
         """
-        A = np.asarray(self.f.coefficients)[:, :, self.signals.state_columns]
+        A = self.linear_state_matrices()
         pairs = []
         for point, matrix in zip(np.asarray(self.f.grid), A, strict=True):
             values = np.linalg.eigvals(matrix).astype(np.complex128)
@@ -284,28 +303,38 @@ def _complex(value: complex) -> str:
 
 
 def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
-    return _sum((model.f, model.e, model.corrected), inputs, value)
+    wide = _with_terms(model, inputs)
+    return _sum((model.f, model.e, model.corrected), (wide, inputs), value)
 
 
 def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
     if model.g is None:
         return jnp.zeros(0)
-    return _sum((model.g, model.e_g, model.corrected_outputs), inputs, value)
+    wide = _with_terms(model, inputs)
+    return _sum((model.g, model.e_g, model.corrected_outputs), (wide, inputs), value)
+
+
+def _with_terms(model: DFSM, inputs: jax.Array) -> jax.Array:
+    """What the linear fits take: [I, φ], and blade harmonics last, of one [I, harmonics]."""
+    if model.terms is None:
+        return inputs
+    n = len(model.signals.inputs)
+    return jnp.concatenate([inputs[:n], model.terms(inputs[:n]), inputs[n:]])
 
 
 def _sum(
     parts: tuple[LinearModel, Corrective | None, tuple[int, ...]],
-    inputs: jax.Array,
+    inputs: tuple[jax.Array, jax.Array],
     value: jax.Array | None,
 ) -> jax.Array:
-    """A linear fit, and its corrective function in some rows, at one input vector."""
+    """A linear fit, and its corrective function in some rows, at what each of them takes."""
     linear, corrective, rows = parts
-    total = linear(inputs, value)
+    total = linear(inputs[0], value)
     if corrective is None:
         return total
     # Written out per row: a scatter costs more than all the rest of a small model.
     place = {row: k for k, row in enumerate(rows)}
-    extra = corrective(inputs)
+    extra = corrective(inputs[1])
     return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(total)])
 
 

@@ -236,6 +236,7 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         corrected_outputs=model.corrected_outputs,
         signals=replace(s, states=(*s.states, *names), latents=names),
         provenance=model.provenance,
+        terms=None if model.terms is None else model.terms.with_more_inputs(at, count),
     )
     return with_poles(wide, dynamics)
 

@@ -33,10 +33,9 @@ class LinearModel(eqx.Module):
     schedule: int | None = eqx.field(static=True)
     known: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
-    @property
-    def known_inputs(self) -> tuple[int, ...]:
-        """Columns of the inputs with a coefficient that is known."""
-        return tuple(sorted({column for _, column in self.known}))
+    def known_among(self, inputs: int) -> tuple[int, ...]:
+        """Which of the first columns have a coefficient that is known."""
+        return tuple(sorted({column for _, column in self.known if column < inputs}))
 
     def at(self, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
         """Return L, shape ``(target, input)``, and b, shape ``(target,)``, at a schedule value.

@@ -18,12 +18,15 @@ from pydantic import TypeAdapter, ValidationError
 from dfsm.core.bundle import MANIFEST, Bundle
 from dfsm.core.files import check_folder
 from dfsm.core.types import Array
+from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance, SignalTable
+from dfsm.models.terms import FORMS as FORMS_OF_TERMS
+from dfsm.models.terms import Terms
 
 FORMAT = 1
 TENSORS = "model.safetensors"
@@ -127,6 +130,15 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
             for field, array in corrective.arrays().items():
                 tensors[f"{prefix}/{name}/{field}"] = np.asarray(array)
             structure[name] = corrective.structure()
+    structure["terms"] = []
+    for k, term in enumerate(model.terms.parts if model.terms is not None else ()):
+        for field, array in term.arrays().items():
+            tensors[f"{prefix}/terms{k}/{field}"] = np.asarray(array)
+        channels = [asdict(c) for c in term.channels]
+        told = {"kind": term.kind, "columns": term.columns, "channels": channels}
+        structure["terms"].append(told | term.structure())
+    if model.terms is not None:
+        keep("terms", model.terms, ("mean", "std"))
     return structure
 
 
@@ -164,6 +176,16 @@ def _put_together(
         told = structure[name]
         return None if told is None else FORMS[told["kind"]].restored(arrays(name), told)
 
+    def terms() -> Terms | None:
+        if not structure.get("terms"):
+            return None
+        parts = []
+        for k, told in enumerate(structure["terms"]):
+            columns, kind = tuple(int(c) for c in told["columns"]), FORMS_OF_TERMS[told["kind"]]
+            channels = TypeAdapter(tuple[Channel, ...]).validate_python(told["channels"])
+            parts.append(kind.restored(columns, channels, arrays(f"terms{k}"), told))
+        return Terms(parts=tuple(parts), **arrays("terms"))
+
     region = {field: arrays("region")[field] for field in _REGION}
     f = linear("f")
     if f is None:
@@ -181,6 +203,7 @@ def _put_together(
         corrected_outputs=tuple(structure["corrected_outputs"]),
         signals=signals,
         provenance=provenance,
+        terms=terms(),
     )
 
 

@@ -14,7 +14,6 @@ from scipy.linalg import eig
 from dfsm.core.types import Array, ComplexArray
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import at_rest
-from dfsm.models.linear import LinearModel
 
 # Between two schedule points A is a mixture of theirs; that many mixtures are examined.
 _MIXTURES = 9
@@ -25,17 +24,14 @@ _DEFECTIVE = float(np.sqrt(np.finfo(float).eps))
 _PLACES = 4
 
 
-def fastest_growth(model: LinearModel, columns: slice) -> float:
-    """Largest real part in 1/s of A's eigenvalues at all schedule values, each frozen.
+def fastest_growth(A: Array) -> float:
+    """Largest real part in 1/s of the eigenvalues at all schedule values, each frozen.
 
     Parameters
     ----------
-    model
-        Fit of all state derivatives.
-    columns
-        Input columns that are states.
+    A
+        Of a linear model at its schedule points, shape ``(point, state, state)``.
     """
-    A = np.asarray(model.coefficients)[:, :, columns]
     at_points = max(float(np.linalg.eigvals(a).real.max()) for a in A)
     return max([at_points, *(growth_between(a, b) for a, b in pairwise(A))])
 

@@ -52,8 +52,8 @@ class StabilityKept:
             return 0.0
         model, worst = self._parameters.at(jnp.asarray(weights)), -np.inf
         growth = self._eigen(model)[0]
-        if model.e is None:
-            worst = fastest_growth(model.f, model.signals.state_columns)
+        if model.e is None and model.terms is None:
+            worst = fastest_growth(model.linear_state_matrices())
         if max(worst, growth.max()) > 0:
             return np.inf
         return float(np.sum(self._excess(growth) ** 2))

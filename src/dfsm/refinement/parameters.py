@@ -8,6 +8,7 @@ a derivative by about its own spread.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -20,12 +21,38 @@ from dfsm.models.corrective import Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, poles, with_poles
 from dfsm.models.linear import LinearModel
+from dfsm.models.terms import Terms
+
+# Length over which coefficients that are free along the schedule change, as a share of its range.
+_LENGTH = 0.25
+
+
+def schedule_ties(grid: Array, freedom: float | None) -> jax.Array:
+    """Matrix T that turns independent parameters into coefficients along the schedule.
+
+    ``T Tᵀ = 1 + freedom² exp(-d²/2)``: what all points share has the variance 1, what is left a
+    Gaussian process with distances d in quarters of the schedule's range.
+
+    Parameters
+    ----------
+    grid
+        Schedule points, shape ``(point,)``.
+    freedom
+        Standard deviation of what varies along the schedule, relative to what all points share;
+        None leaves the points unrelated.
+    """
+    if freedom is None or len(grid) == 1:
+        return jnp.eye(len(grid))
+    apart = (grid[:, None] - grid) / (_LENGTH * np.ptp(grid))
+    K = 1.0 + freedom**2 * (np.exp(-(apart**2) / 2) + 1e-6 * np.eye(len(grid)))
+    return jnp.asarray(np.linalg.cholesky(K))
 
 
 class Parametrization(eqx.Module):
     """Deviations from a model, and the model that they make.
 
-    Coefficients that do not depend on the schedule stay so.
+    Coefficients that do not depend on the schedule stay so. Those that do may be tied: with decay,
+    what is free along the schedule then has the prior of a Gaussian process there.
 
     Attributes
     ----------
@@ -41,6 +68,8 @@ class Parametrization(eqx.Module):
         Which of the constant coefficients may change, by row: those that physics gave stay.
     driven
         Input columns that drive the latent pairs.
+    ties
+        How the parameters of all schedule points make the coefficients at each, ``(point, point)``.
     """
 
     model: DFSM
@@ -50,23 +79,35 @@ class Parametrization(eqx.Module):
     constant: tuple[int, ...] = eqx.field(static=True)
     free: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     driven: tuple[int, ...] = eqx.field(static=True)
+    ties: jax.Array
 
     @classmethod
-    def of(cls, model: DFSM, spread: Array) -> Parametrization:
-        """Make one; `spread` holds the typical size of the observed states' derivatives."""
+    def of(cls, model: DFSM, spread: Array, freedom: float | None = None) -> Parametrization:
+        """Make one.
+
+        Parameters
+        ----------
+        model
+            At zero.
+        spread
+            Typical size of the observed states' derivatives, shape ``(state,)``.
+        freedom
+            See `schedule_ties`; None leaves schedule points unrelated.
+        """
         s = model.signals
         known = kinematic_rows(s.specs)
         rows = tuple(i for i in range(len(s.observed)) if i not in known)
         L = np.asarray(model.f.coefficients)[:, list(rows)]
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
-        varies[list(model.f.known_inputs)] = False
+        varies[list(model.f.known_among(len(varies)))] = False
         # Nothing is known yet about states that have only been added.
         varies[s.latent_columns] = True
         scheduled, constant = (tuple(np.flatnonzero(v).tolist()) for v in (varies, ~varies))
         free = tuple(tuple((i, c) not in model.f.known for c in constant) for i in rows)
         typical = np.maximum(spread[list(rows)], np.finfo(float).tiny)
         driven = tuple(np.flatnonzero(np.asarray(poles(model).drive).any(axis=0)).tolist())
-        return cls(model, jnp.asarray(typical), rows, scheduled, constant, free, driven)
+        ties = schedule_ties(np.asarray(model.f.grid), freedom)
+        return cls(model, jnp.asarray(typical), rows, scheduled, constant, free, driven, ties)
 
     @property
     def size(self) -> int:
@@ -94,8 +135,14 @@ class Parametrization(eqx.Module):
             (rows, len(self.constant)),
             (2, pairs),
             (2, pairs, len(self.driven) + 1),
+            *self._term_shapes,
             *self._corrective_shapes,
         ]
+
+    @property
+    def _term_shapes(self) -> list[tuple[int, ...]]:
+        terms = self.model.terms
+        return [] if terms is None else [a.shape for a in terms.parameters]
 
     @property
     def _corrective_shapes(self) -> list[tuple[int, ...]]:
@@ -104,9 +151,13 @@ class Parametrization(eqx.Module):
 
     def at(self, deviations: jax.Array) -> DFSM:
         """The model at some deviations, shape ``(parameter,)``; JAX can follow it."""
-        scheduled, constant, dynamics, drive, *corrective = self._parts(deviations)
+        scheduled, constant, dynamics, drive, *others = self._parts(deviations)
+        terms, corrective = self._divided(others)
         model = replace(
-            self.model, f=self._linear(scheduled, constant), e=self._corrective(corrective)
+            self.model,
+            f=self._linear(scheduled, constant),
+            e=self._corrective(corrective),
+            terms=self._terms(terms),
         )
         return self._latents(model, dynamics, drive) if self.model.signals.latents else model
 
@@ -135,7 +186,8 @@ class Parametrization(eqx.Module):
             Shape ``(step, observed state, parameter)``; zero for the latent pairs' own.
         """
         steps, stages, observed = weights.shape[:3]
-        z, hats = self._standardised(inputs), jax.vmap(jax.vmap(model.f.shares))(inputs)
+        z = jax.vmap(jax.vmap(partial(self._wide, model)))(inputs)
+        hats = jax.vmap(jax.vmap(model.f.shares))(inputs) @ self.ties
         by_row = weights[..., list(self.rows)] * self.spread
         ones = jnp.ones((steps, stages, 1))
         moved = jnp.concatenate([z[..., np.array(self.scheduled, dtype=int)], ones], axis=2)
@@ -152,15 +204,37 @@ class Parametrization(eqx.Module):
         parts = [scheduled, always * self._free]
         parts = [jnp.reshape(p, (steps, observed, -1)) for p in parts]
         parts.append(jnp.zeros((steps, observed, self.latent_columns.size)))
+        if self._term_shapes:
+            by_term = self._term_slopes(deviations, model, inputs)
+            rows = weights[..., list(self.rows)]
+            parts += [jnp.einsum("tiar,tirp->tap", rows, by_term)]
         if self._corrective_shapes:
             corrected = weights[..., list(self.model.corrected)]
             by_part = self._corrective_slopes(deviations, inputs)
             parts += [jnp.einsum("tiar,tirp->tap", corrected, by_part)]
         return jnp.concatenate(parts, axis=2)
 
+    def _term_slopes(self, deviations: jax.Array, model: DFSM, inputs: jax.Array) -> jax.Array:
+        """∂(L_φ φ)/∂θ, shape ``(step, i, row, parameter of terms)``."""
+        terms, _ = self._divided(self._parts(deviations)[4:])
+        first, rows = len(model.signals.inputs), list(self.rows)
+
+        def at_one(inputs: jax.Array) -> jax.Array:
+            def values(parts: list[jax.Array]) -> jax.Array:
+                moved = self._terms(parts)
+                return jnp.zeros(0) if moved is None else moved(inputs)
+
+            by_part = jax.jacfwd(values)(terms)
+            J = jnp.concatenate([p.reshape(p.shape[0], -1) for p in by_part], axis=1)
+            L, _ = model.f.at(inputs[model.f.schedule or 0])
+            return L[np.array(rows), first:] @ J
+
+        return jax.vmap(jax.vmap(at_one))(inputs)
+
     def _corrective_slopes(self, deviations: jax.Array, inputs: jax.Array) -> jax.Array:
         """∂e/∂θ, shape ``(step, i, corrected row, corrective parameter)``."""
-        corrective, rows = self._parts(deviations)[4:], len(self.model.corrected)
+        _, corrective = self._divided(self._parts(deviations)[4:])
+        rows = len(self.model.corrected)
 
         def at_one(inputs: jax.Array) -> jax.Array:
             by_part = jax.jacrev(lambda parts: self._correction(parts, inputs))(corrective)
@@ -196,6 +270,23 @@ class Parametrization(eqx.Module):
         region = self.model.region
         return (inputs - region.mean) / region.scale
 
+    def _wide(self, model: DFSM, inputs: jax.Array) -> jax.Array:
+        """[I, φ] of one input vector, standardised."""
+        wide = inputs if model.terms is None else model.terms.extend(inputs)
+        mean, scale = self._moments
+        return (wide - mean) / scale
+
+    @property
+    def _moments(self) -> tuple[jax.Array, jax.Array]:
+        """Mean and scale of [I, φ]."""
+        region, terms = self.model.region, self.model.terms
+        if terms is None:
+            return region.mean, region.scale
+        return (
+            jnp.concatenate([region.mean, terms.mean]),
+            jnp.concatenate([region.scale, terms.scale]),
+        )
+
     @property
     def _constant_columns(self) -> IntArray:
         return np.array(self.constant, dtype=int)
@@ -212,15 +303,25 @@ class Parametrization(eqx.Module):
             start += count
         return parts
 
+    def _divided(self, parts: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+        """Parts of the terms and of the corrective function."""
+        count = len(self._term_shapes)
+        return parts[:count], parts[count:]
+
+    def _terms(self, parts: list[jax.Array]) -> Terms | None:
+        terms = self.model.terms
+        return None if terms is None else terms.moved(parts)
+
     def _linear(self, scheduled: jax.Array, constant: jax.Array) -> LinearModel:
-        f, region = self.model.f, self.model.region
-        std = region.scale
+        f = self.model.f
+        mean, std = self._moments
+        scheduled = jnp.einsum("kp,prc->krc", self.ties, scheduled)
         change = jnp.zeros((len(f.grid), len(self.rows), len(std)))
         change = change.at[:, :, np.array(self.scheduled, dtype=int)].set(scheduled[..., :-1])
         change = change.at[:, :, self._constant_columns].set(constant * self._free)
         L = change * self.spread[:, None] / std
         # The offset belongs to the middle of the data, where coefficients do not disturb it.
-        b = scheduled[..., -1] * self.spread - L @ region.mean
+        b = scheduled[..., -1] * self.spread - L @ mean
         return replace(
             f,
             coefficients=f.coefficients.at[:, list(self.rows)].add(L),

@@ -113,7 +113,7 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
-    return replace(model, e=network.ignoring(model.f.known_inputs), corrected=rows)
+    return replace(model, e=network.ignoring(model.f.known_among(inputs)), corrected=rows)
 
 
 def _poles(decay: Array, drive: Array, middle: Array) -> Poles:

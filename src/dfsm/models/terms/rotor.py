@@ -58,10 +58,11 @@ class Rotor:
         Of `speed` to the speed of the rotor.
     corrections
         Further channels d_k in m/s, e.g. averages of the wind over rings of the disk less that
-        over the disk: Σ a_k d_k is added to the wind, with weights that refinement learns.
-    inertia
-        Of all that turns, about the rotor's axis, in kg m²; with it the fit knows what the torques
-        do to the speed.
+        over the disk: Σ a_k d_k is added to the wind, with weights that refinement learns. In
+        derivatives they act through the rotor alone.
+    inertia, generator_torque
+        Of all that turns, about the rotor's axis, in kg m², and the channel of the torque that
+        brakes it, in kN-m: with both the fit knows what the torques do to the speed.
     efficiency
         Of the gearbox: the part of the rotor's power that reaches the generator.
     name
@@ -80,6 +81,7 @@ class Rotor:
     gearbox_ratio: float = 1.0
     corrections: tuple[str, ...] = ()
     inertia: float | None = None
+    generator_torque: str | None = None
     efficiency: float = 1.0
     name: str = "rotor"
     kind: Literal["rotor"] = "rotor"
@@ -106,6 +108,14 @@ class Rotor:
             raise DfsmError(
                 f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: the platform's "
                 "motion at the hub is their product, set both or neither"
+            )
+        if (self.inertia is None) != (self.generator_torque is None):
+            here, lacking = "inertia", "generator_torque"
+            if self.inertia is None:
+                here, lacking = lacking, here
+            raise DfsmError(
+                f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: what a torque "
+                "does to the speed takes both, set both or neither"
             )
         twice = [n for n in self.inputs if self.inputs.count(n) > 1]
         if twice:
@@ -152,6 +162,9 @@ class Rotor:
         if self.pitch_rate is not None and self.hub_height is not None:
             rate = _factor(what, "pitch_rate", channels[self.pitch_rate], _RATES)
             arm = self.hub_height * rate
+        if self.generator_torque is not None:
+            braking = input_columns(what, (self.generator_torque,), channels, columns)[0]
+            _factor(what, "generator_torque", braking[0], {"kNm": 1.0})
         table = self.table
         if not isinstance(table, RotorTable):
             table = read_rotor_table(table)

@@ -1,0 +1,134 @@
+"""What is known of the coefficients of the derivatives before any run is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dfsm.data.derivatives import kinematic_rows
+from dfsm.errors import DfsmError, near_matches
+from dfsm.fitting.samples import Samples
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.terms import Rotor, RotorTerm
+
+
+@dataclass(frozen=True)
+class KnownCoefficients:
+    """Coefficients that least squares does not fit, by fitted row and column of [I, φ].
+
+    Attributes
+    ----------
+    fixed
+        Never changed.
+    first
+        Where refinement on rollouts begins.
+    """
+
+    fixed: Mapping[tuple[int, int], float]
+    first: Mapping[tuple[int, int], float]
+
+
+def known_coefficients(
+    samples: Samples, settings: FitSettings, fitted: Sequence[int]
+) -> KnownCoefficients:
+    """What ``linear.known``, ``linear.only`` and rotors of known inertia say.
+
+    Parameters
+    ----------
+    samples
+        Tell the names of rows and columns.
+    settings
+        Of the fit.
+    fitted
+        Rows that are not kinematic.
+
+    Raises
+    ------
+    DfsmError
+        A name is no state or no input, or a rotor's speed is no state.
+    """
+    rates = kinematic_rows(settings.states)
+    rows = {
+        spec.name: list(fitted).index(rates.get(i, i)) for i, spec in enumerate(settings.states)
+    }
+    names = samples.linear_names
+    known, only = _mechanics(samples, settings)
+    known = {**known, **settings.linear.known}
+    only = {**only, **settings.linear.only}
+    fixed, first = dict[tuple[int, int], float](), dict[tuple[int, int], float]()
+    for name in (n for s in settings.terms if isinstance(s, Rotor) for n in s.corrections):
+        fixed.update({(row, names.index(name)): 0.0 for row in rows.values()})
+    for state, inputs in only.items():
+        row = _row(rows, state, "only")
+        columns = [_column(names, n, f"only.{state}") for n in inputs]
+        first.update({(row, c): 0.0 for c in range(len(names)) if c not in columns})
+    for state, coefficients in known.items():
+        row = _row(rows, state, "known")
+        for name, value in coefficients.items():
+            place = row, _column(names, name, f"known.{state}")
+            fixed[place] = float(value)
+            first.pop(place, None)
+    for place, value in _aerodynamics(samples, settings, rows).items():
+        if place not in fixed:
+            first[place] = value
+    return KnownCoefficients(fixed, first)
+
+
+def _row(rows: Mapping[str, int], state: str, key: str) -> int:
+    if state not in rows:
+        raise DfsmError(
+            f"linear.{key} names '{state}', which is not a state; " + near_matches(state, rows)
+        )
+    return rows[state]
+
+
+def _column(names: Sequence[str], name: str, key: str) -> int:
+    if name not in names:
+        raise DfsmError(
+            f"linear.{key} names '{name}', which is no input of the model; "
+            + near_matches(name, names)
+        )
+    return list(names).index(name)
+
+
+# -- rotors of known inertia, J ω̇ = Q - τ ---------------------------------------------------------
+
+
+def _rotors(samples: Samples, settings: FitSettings) -> list[tuple[Rotor, RotorTerm]]:
+    parts = () if samples.terms is None else samples.terms.parts
+    pairs = zip(settings.terms, parts, strict=True)
+    return [
+        (s, t)
+        for s, t in pairs
+        if isinstance(s, Rotor) and isinstance(t, RotorTerm) and s.inertia is not None
+    ]
+
+
+def _mechanics(
+    samples: Samples, settings: FitSettings
+) -> tuple[dict[str, dict[str, float]], dict[str, tuple[str, ...]]]:
+    """What the generator's torque does, and that a rotor's speed answers to both torques alone.
+
+    In closed loop torque and blade pitch follow the speed, and least squares on derivatives would
+    take that for a property of the rotor.
+    """
+    known, only = {}, {}
+    for rotor, term in _rotors(samples, settings):
+        brake = term.acceleration_per_generator_torque
+        if rotor.generator_torque is not None and brake is not None:
+            known[rotor.speed] = {rotor.generator_torque: brake}
+            only[rotor.speed] = (rotor.generator_torque, term.channels[1].name)
+    return known, only
+
+
+def _aerodynamics(
+    samples: Samples, settings: FitSettings, rows: Mapping[str, int]
+) -> dict[tuple[int, int], float]:
+    """What the rotor's own torque does, by its table: where refinement begins."""
+    values = {}
+    for rotor, term in _rotors(samples, settings):
+        push = term.acceleration_per_rotor_torque
+        if rotor.generator_torque is not None and push is not None:
+            column = samples.linear_names.index(term.channels[1].name)
+            values[_row(rows, rotor.speed, "known"), column] = push
+    return values
