@@ -341,8 +341,8 @@ def _check_entries(where: str, name: str, values: Array, size: tuple[int, int]) 
         )
     if bad := int((~np.isfinite(values)).sum()):
         raise DfsmError(
-            f"{where}: {name} is not finite at {bad} of {values.size} places: leave out pitch angles or tip speed "
-            "ratios at which the rotor code did not converge"
+            f"{where}: {name} is not finite at {bad} of {values.size} places: leave out "
+            "pitch angles or tip speed ratios at which the rotor code did not converge"
         )
 
 
