@@ -11,7 +11,7 @@ import time as clock
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
+from dfsm.data.readers.rotor_table import RotorTable
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
@@ -350,6 +351,17 @@ def _unexpected(model: DFSM) -> str:
     )
 
 
+def _told(settings: FitSettings) -> list[dict[str, Any]]:
+    """Settings of the terms as far as text and numbers can tell them; tables stay in the model."""
+    plain = (str, int, float, tuple, type(None))
+    return [
+        {f.name: v if isinstance(v, plain) else str(getattr(v, "__name__", v))
+         for f in fields(term)
+         if not isinstance(v := getattr(term, f.name), RotorTable)}
+        for term in settings.terms
+    ]
+
+
 def _record(
     data: Dataset,
     settings: FitSettings,
@@ -360,7 +372,7 @@ def _record(
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     return {
-        "settings": asdict(settings),
+        "settings": {**asdict(replace(settings, terms=())), "terms": _told(settings)},
         "channels": [c.name for c in data[0].channels if not c.computed],
         "data": [
             {"name": r.name, "samples": len(r), "sha256": r.digest, "seconds": r.duration}

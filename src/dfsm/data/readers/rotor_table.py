@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from dfsm.core.files import existing_file
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.core.units import ANGLES
 from dfsm.data.readers.columns import split_header
 from dfsm.errors import DfsmError
@@ -98,7 +98,7 @@ class RotorTable:
         return float(self.tip_speed_ratio[row]), float(self.pitch[column])
 
 
-# What a caller may give pydantic instead of a file name: an instance, never a mapping.
+# Settings may hold a table itself beside the name of its file.
 RotorTable.__pydantic_config__ = {  # pyright: ignore[reportAttributeAccessIssue]
     "arbitrary_types_allowed": True,
     "extra": "forbid",
@@ -278,7 +278,9 @@ def _columns(path: Path, header: Sequence[str]) -> tuple[dict[str, int], str]:
         if field == "pitch" and told:
             unit = _UNITS.get(told.casefold(), told)
             if unit not in ANGLES:
-                raise DfsmError(f"{path}: blade pitch is in '{told}', expected deg or rad")
+                raise DfsmError(
+                    f"{path}: blade pitch is in '{told}', expected deg or rad: convert it"
+                )
     for field in ("pitch", "tip_speed_ratio", "cp", "ct"):
         if field not in columns:
             shown = ", ".join(cell.strip() for cell in header[:12])[:200]
@@ -289,7 +291,7 @@ def _columns(path: Path, header: Sequence[str]) -> tuple[dict[str, int], str]:
     return columns, unit
 
 
-def _axis(values: Array) -> tuple[Array, Array]:
+def _axis(values: Array) -> tuple[Array, IntArray]:
     """The different values, increasing, and which of them each one is.
 
     Values that differ by rounding, as 0.1 + 0.2 and 0.3, are one.
@@ -339,8 +341,8 @@ def _check_entries(where: str, name: str, values: Array, size: tuple[int, int]) 
         )
     if bad := int((~np.isfinite(values)).sum()):
         raise DfsmError(
-            f"{where}: {bad} values of {name} are not finite: leave out pitch angles or tip speed "
-            "ratios at which the rotor code did not converge"
+            f"{where}: {name} is not finite at {bad} of {values.size} places: leave out "
+            "pitch angles or tip speed ratios at which the rotor code did not converge"
         )
 
 

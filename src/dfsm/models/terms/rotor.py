@@ -408,9 +408,12 @@ class RotorTerm(Term):
         structure: Mapping[str, Any],
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
-        about = {f.name: structure["about"][f.name] for f in fields(RotorConstants)}
-        # JSON keeps tuples as lists, which cannot be compared to compiled functions' keys.
-        about = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items()}
+        told = structure["about"]
+        # JSON turns tuples into lists, which are no keys of compiled functions.
+        about: dict[str, Any] = {
+            f.name: tuple(told[f.name]) if isinstance(told[f.name], list) else told[f.name]
+            for f in fields(RotorConstants)
+        }
         return cls(
             columns=columns,
             channels=channels,

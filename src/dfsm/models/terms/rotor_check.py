@@ -22,6 +22,8 @@ _RADIANS = 1.6
 # Below this share of the best tip speed ratio a rotor sheds power, which it does by pitching.
 _SHEDDING = 0.75
 _FEWEST = 50
+# A pitch that moves less than this, in its unit, does not control anything even in rad.
+_STILL = 0.05
 # Samples whose power is computed at most.
 _MOST = 2000
 
@@ -116,8 +118,8 @@ def _check_degrees(
     rows = signals[shedding]
     turned = rows.copy()
     turned[:, 2] = np.rad2deg(rows[:, 2])
-    as_told, as_rad = (_unsteadiness(term, r, tips[shedding]) for r in (rows, turned))
-    if as_rad < 0.5 * as_told:
+    (told, spread), (mean, steady) = (_power(term, r, tips[shedding]) for r in (rows, turned))
+    if np.ptp(pitch[shedding]) > _STILL and 0 < mean < told and steady < 0.5 * spread:
         name = about.inputs[2]
         raise DfsmError(
             f"{term.channels[0].name}: '{name}' says deg and stays within {largest:.3g}, but only "
@@ -126,8 +128,8 @@ def _check_degrees(
     return []
 
 
-def _unsteadiness(term: RotorTerm, rows: Array, tips: Array) -> float:
-    """Standard deviation of the rotor's power over its mean."""
+def _power(term: RotorTerm, rows: Array, tips: Array) -> tuple[float, float]:
+    """Mean and standard deviation of the rotor's power, in kW."""
     torque = np.asarray(jax.vmap(term.values)(jnp.asarray(rows)))[:, 1]
-    power = torque * tips
-    return float(np.std(power) / max(abs(np.mean(power)), 1e-12))
+    power = torque * tips / term.about.radius
+    return float(np.mean(power)), float(np.std(power))
