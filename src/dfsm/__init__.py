@@ -30,10 +30,12 @@ if TYPE_CHECKING:
     from dfsm.data.features import Feature
     from dfsm.data.info import describe
     from dfsm.data.readers import read, read_all
+    from dfsm.data.readers.mann import BoxSettings, read_mann
+    from dfsm.data.readers.rotor_table import RotorTable, read_rotor_table
     from dfsm.data.readers.tables import write_table
     from dfsm.data.readers.turbsim import read_turbsim
     from dfsm.data.trajectory import Channel, Trajectory
-    from dfsm.data.wind_field import with_field_wind
+    from dfsm.data.wind_field import with_field_wind, with_harmonics
     from dfsm.errors import DfsmError, DfsmWarning
     from dfsm.exports.rosco import RoscoInput, write_rosco
     from dfsm.fitting.corrective import NoCorrection
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from dfsm.models.model_folder import load, load_all, save
     from dfsm.models.signals import Azimuth
     from dfsm.models.steady import SteadyState, steady_state
+    from dfsm.models.terms import Function, Product, QuadraticDrag, Rotor
     from dfsm.refinement.refine import RefineResult, RefineSettings, refine
     from dfsm.report import write_report, write_solution_report
     from dfsm.selection.compare import RankedCandidate, Ranking, compare
@@ -80,7 +83,12 @@ _HOME = {
     "write_table": "data.readers.tables",
     "describe": "data.info",
     "read_turbsim": "data.readers.turbsim",
+    "read_mann": "data.readers.mann",
+    "BoxSettings": "data.readers.mann",
     "with_field_wind": "data.wind_field",
+    "with_harmonics": "data.wind_field",
+    "RotorTable": "data.readers.rotor_table",
+    "read_rotor_table": "data.readers.rotor_table",
     "RandomKnots": "simulators.excitation",
     "RandomSteps": "simulators.excitation",
     "Multisine": "simulators.excitation",
@@ -103,6 +111,10 @@ _HOME = {
     "GP": "fitting.corrective.gaussian_process",
     "MLP": "fitting.corrective.perceptron",
     "NoCorrection": "fitting.corrective",
+    "Rotor": "models.terms",
+    "QuadraticDrag": "models.terms",
+    "Product": "models.terms",
+    "Function": "models.terms",
     "Azimuth": "models.signals",
     "DFSM": "models.dfsm",
     "SteadyState": "models.steady",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError
 
 from dfsm.config.parse import Strict, explain, load_yaml, parse_file
 from dfsm.core.settings import require
@@ -20,7 +21,7 @@ from dfsm.fitting.corrective import MLP, CorrectiveSettings
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
-from dfsm.models.terms import TermSettings
+from dfsm.models.terms import Rotor, TermSettings
 from dfsm.refinement.refine import RefineSettings
 from dfsm.selection.compare import HOLD_OUT, check_candidates
 from dfsm.selection.trial import Candidate
@@ -103,6 +104,12 @@ class Config(Strict):
     refine: RefineSettings | None = None
     seed: int = FitSettings.seed
     compare: CompareConfig = CompareConfig()
+    _folder: Path = PrivateAttr(default=Path())
+
+    def at(self, folder: Path) -> Config:
+        """The same configuration, whose files are named from a folder."""
+        self._folder = folder
+        return self
 
     def fit_settings(self) -> FitSettings:
         """The settings of `fit`."""
@@ -119,13 +126,18 @@ class Config(Strict):
             hub_height=self.data.hub_height,
             derivatives=self.derivatives,
             linear=self.linear,
-            terms=tuple(self.terms),
+            terms=tuple(self._rooted(term) for term in self.terms),
             corrective=self.corrective,
             gate=self.gate,
             azimuth=self.azimuth,
             nonlinear_only=self.nonlinear_only,
             seed=self.seed,
         )
+
+    def _rooted(self, term: TermSettings) -> TermSettings:
+        if isinstance(term, Rotor) and isinstance(term.table, str | Path):
+            return replace(term, table=self._folder / term.table)
+        return term
 
 
 def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
@@ -175,14 +187,16 @@ def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:
             BASE: Candidate(config.fit_settings(), config.refine, f"{path.name} as it stands")
         }
         for name, changes in config.compare.candidates.items():
-            candidates[name] = _candidate(raw, name, changes)
+            candidates[name] = _candidate(raw, name, changes, path.parent)
         check_candidates(candidates)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
     return config, candidates
 
 
-def _candidate(raw: Mapping[str, Any], name: str, changes: Mapping[str, Any]) -> Candidate:
+def _candidate(
+    raw: Mapping[str, Any], name: str, changes: Mapping[str, Any], folder: Path
+) -> Candidate:
     where = f"{_CANDIDATES}.{name}"
     if name == BASE:
         raise DfsmError(f"'{where}' is the configuration itself: choose another name")
@@ -194,7 +208,7 @@ def _candidate(raw: Mapping[str, Any], name: str, changes: Mapping[str, Any]) ->
             )
     merged = _merged(raw, changes)
     try:
-        config = Config.model_validate(merged)
+        config = Config.model_validate(merged).at(folder)
         _check_together(config)
     except ValidationError as error:
         raise DfsmError(explain(error, merged, Config, f"{where}.")) from None
@@ -242,4 +256,4 @@ def _check_together(config: Config) -> None:
 
 def parse_config(path: Path) -> Config:
     """Read and check a configuration without touching the data."""
-    return parse_file(path, Config, _ADVICE)
+    return parse_file(path, Config, _ADVICE).at(path.parent)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
@@ -22,8 +22,8 @@ from threadpoolctl import threadpool_limits
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
-from dfsm.data.readers.rotor_table import RotorTable
 from dfsm.data.derivatives import kinematic_rows
+from dfsm.data.readers.rotor_table import RotorTable
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.contraction import contraction
@@ -302,7 +302,7 @@ def _check(
 
     Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
     """
-    notes = data_warnings(data, settings)
+    notes = data_warnings(data, settings, samples)
     x, u, w, p = model.split(samples.inputs)
     values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
     if not np.isfinite(values).all():
@@ -355,9 +355,11 @@ def _told(settings: FitSettings) -> list[dict[str, Any]]:
     """Settings of the terms as far as text and numbers can tell them; tables stay in the model."""
     plain = (str, int, float, tuple, type(None))
     return [
-        {f.name: v if isinstance(v, plain) else str(getattr(v, "__name__", v))
-         for f in fields(term)
-         if not isinstance(v := getattr(term, f.name), RotorTable)}
+        {
+            f.name: v if isinstance(v, plain) else str(getattr(v, "__name__", v))
+            for f in fields(term)
+            if not isinstance(v := getattr(term, f.name), RotorTable)
+        }
         for term in settings.terms
     ]
 

@@ -22,7 +22,6 @@ from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.inputs import InputOrder
-from dfsm.models.terms import Terms, terms_of
 from dfsm.models.signals import (
     Azimuth,
     SignalTable,
@@ -31,6 +30,7 @@ from dfsm.models.signals import (
     require_constant,
     with_computed,
 )
+from dfsm.models.terms import Terms, terms_of
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,11 @@ class Samples:
         if self.terms is None:
             return self.inputs
         return np.concatenate([self.inputs, self.terms.along(self.inputs)], axis=1)
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """Samples of every input by name, each ``(sample,)``."""
+        return dict(zip((c.name for c in self.signals.inputs), self.inputs.T, strict=True))
 
     @property
     def linear_names(self) -> list[str]:
@@ -122,9 +127,10 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     return data
 
 
-def data_warnings(data: Dataset, settings: FitSettings) -> list[str]:
+def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> list[str]:
     """What a user should know about the data before trusting a fit, one sentence each."""
-    warnings = [text for name in settings.disturbances if (text := wind_warning(name))]
+    doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
+    warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
     gaps = [
         f"{run.where}: {text}"
         for run in data

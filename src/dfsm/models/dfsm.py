@@ -26,8 +26,8 @@ from dfsm.errors import DfsmError, printable
 from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
-from dfsm.models.terms import Terms
 from dfsm.models.signals import Provenance, SignalTable, blade_harmonics
+from dfsm.models.terms import Terms
 
 if TYPE_CHECKING:
     import control

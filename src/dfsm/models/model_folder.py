@@ -18,15 +18,13 @@ from pydantic import TypeAdapter, ValidationError
 from dfsm.core.bundle import MANIFEST, Bundle
 from dfsm.core.files import check_folder
 from dfsm.core.types import Array
-from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance, SignalTable
-from dfsm.models.terms import FORMS as FORMS_OF_TERMS
-from dfsm.models.terms import Terms
+from dfsm.models.terms import ScalarFunction, Terms, restored_term, told_term
 
 FORMAT = 1
 TENSORS = "model.safetensors"
@@ -73,19 +71,32 @@ def check_target(path: str | Path) -> None:
     check_folder(path, is_ours=_is_model)
 
 
-def load(path: str | Path) -> DFSM:
+def load(path: str | Path, functions: Mapping[str, ScalarFunction] | None = None) -> DFSM:
     """Read the multi-fidelity model of a model folder.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    functions
+        The Python functions of the model's terms by name, which no folder holds, see `Function`.
 
     Raises
     ------
     DfsmError
-        The folder is missing, not a model, damaged, or written by a newer version.
+        The folder is missing, not a model, damaged, or written by a newer version, or a function
+        is missing.
     """
-    return load_all(path)[MULTI_FIDELITY]
+    return load_all(path, functions)[MULTI_FIDELITY]
 
 
-def load_all(path: str | Path) -> dict[str, DFSM]:
-    """Read all models of a model folder by name: multi-fidelity, and nonlinear-only if kept."""
+def load_all(
+    path: str | Path, functions: Mapping[str, ScalarFunction] | None = None
+) -> dict[str, DFSM]:
+    """Read all models of a model folder by name: multi-fidelity, and nonlinear-only if kept.
+
+    The arguments are those of `load`.
+    """
     path = Path(path)
     manifest = _read_manifest(path)
     tensors = _BUNDLE.read_tensors(path, manifest)
@@ -93,7 +104,7 @@ def load_all(path: str | Path) -> dict[str, DFSM]:
         signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
         provenance = Provenance(manifest["provenance"])
         return {
-            name: _put_together(structure, name, tensors, signals, provenance)
+            name: _put_together(structure, name, tensors, (signals, provenance), functions or {})
             for name, structure in manifest["models"].items()
         }
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
@@ -134,9 +145,7 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
     for k, term in enumerate(model.terms.parts if model.terms is not None else ()):
         for field, array in term.arrays().items():
             tensors[f"{prefix}/terms{k}/{field}"] = np.asarray(array)
-        channels = [asdict(c) for c in term.channels]
-        told = {"kind": term.kind, "columns": term.columns, "channels": channels}
-        structure["terms"].append(told | term.structure())
+        structure["terms"].append(told_term(term))
     if model.terms is not None:
         keep("terms", model.terms, ("mean", "std"))
     return structure
@@ -151,9 +160,10 @@ def _put_together(
     structure: Mapping[str, Any],
     prefix: str,
     tensors: Mapping[str, Array],
-    signals: SignalTable,
-    provenance: Provenance,
+    about: tuple[SignalTable, Provenance],
+    functions: Mapping[str, ScalarFunction],
 ) -> DFSM:
+    signals, provenance = about
     complete = {f"{prefix}/region/whitening": _NO_DENSITY, **tensors}
 
     def arrays(name: str) -> dict[str, Any]:
@@ -179,11 +189,10 @@ def _put_together(
     def terms() -> Terms | None:
         if not structure.get("terms"):
             return None
-        parts = []
-        for k, told in enumerate(structure["terms"]):
-            columns, kind = tuple(int(c) for c in told["columns"]), FORMS_OF_TERMS[told["kind"]]
-            channels = TypeAdapter(tuple[Channel, ...]).validate_python(told["channels"])
-            parts.append(kind.restored(columns, channels, arrays(f"terms{k}"), told))
+        parts = [
+            restored_term(told, arrays(f"terms{k}"), functions)
+            for k, told in enumerate(structure["terms"])
+        ]
         return Terms(parts=tuple(parts), **arrays("terms"))
 
     region = {field: arrays("region")[field] for field in _REGION}
