@@ -23,36 +23,11 @@ from dfsm.models.latents import Poles, poles, with_poles
 from dfsm.models.linear import LinearModel
 from dfsm.models.terms import Terms
 
-# Length over which coefficients that are free along the schedule change, as a share of its range.
-_LENGTH = 0.25
-
-
-def schedule_ties(grid: Array, freedom: float | None) -> jax.Array:
-    """Matrix T that turns independent parameters into coefficients along the schedule.
-
-    ``T Tᵀ = 1 + freedom² exp(-d²/2)``: what all points share has the variance 1, what is left a
-    Gaussian process with distances d in quarters of the schedule's range.
-
-    Parameters
-    ----------
-    grid
-        Schedule points, shape ``(point,)``.
-    freedom
-        Standard deviation of what varies along the schedule, relative to what all points share;
-        None leaves the points unrelated.
-    """
-    if freedom is None or len(grid) == 1:
-        return jnp.eye(len(grid))
-    apart = (grid[:, None] - grid) / (_LENGTH * np.ptp(grid))
-    K = 1.0 + freedom**2 * (np.exp(-(apart**2) / 2) + 1e-6 * np.eye(len(grid)))
-    return jnp.asarray(np.linalg.cholesky(K))
-
 
 class Parametrization(eqx.Module):
     """Deviations from a model, and the model that they make.
 
-    Coefficients that do not depend on the schedule stay so. Those that do may be tied: with decay,
-    what is free along the schedule then has the prior of a Gaussian process there.
+    Coefficients that do not depend on the schedule stay so.
 
     Attributes
     ----------
@@ -68,8 +43,6 @@ class Parametrization(eqx.Module):
         Which of the constant coefficients may change, by row: those that physics gave stay.
     driven
         Input columns that drive the latent pairs.
-    ties
-        How the parameters of all schedule points make the coefficients at each, ``(point, point)``.
     """
 
     model: DFSM
@@ -79,21 +52,10 @@ class Parametrization(eqx.Module):
     constant: tuple[int, ...] = eqx.field(static=True)
     free: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     driven: tuple[int, ...] = eqx.field(static=True)
-    ties: jax.Array
 
     @classmethod
-    def of(cls, model: DFSM, spread: Array, freedom: float | None = None) -> Parametrization:
-        """Make one.
-
-        Parameters
-        ----------
-        model
-            At zero.
-        spread
-            Typical size of the observed states' derivatives, shape ``(state,)``.
-        freedom
-            See `schedule_ties`; None leaves schedule points unrelated.
-        """
+    def of(cls, model: DFSM, spread: Array) -> Parametrization:
+        """Make one; `spread` holds the typical size of the observed states' derivatives."""
         s = model.signals
         known = kinematic_rows(s.specs)
         rows = tuple(i for i in range(len(s.observed)) if i not in known)
@@ -106,8 +68,7 @@ class Parametrization(eqx.Module):
         free = tuple(tuple((i, c) not in model.f.known for c in constant) for i in rows)
         typical = np.maximum(spread[list(rows)], np.finfo(float).tiny)
         driven = tuple(np.flatnonzero(np.asarray(poles(model).drive).any(axis=0)).tolist())
-        ties = schedule_ties(np.asarray(model.f.grid), freedom)
-        return cls(model, jnp.asarray(typical), rows, scheduled, constant, free, driven, ties)
+        return cls(model, jnp.asarray(typical), rows, scheduled, constant, free, driven)
 
     @property
     def size(self) -> int:
@@ -187,7 +148,7 @@ class Parametrization(eqx.Module):
         """
         steps, stages, observed = weights.shape[:3]
         z = jax.vmap(jax.vmap(partial(self._wide, model)))(inputs)
-        hats = jax.vmap(jax.vmap(model.f.shares))(inputs) @ self.ties
+        hats = jax.vmap(jax.vmap(model.f.shares))(inputs)
         by_row = weights[..., list(self.rows)] * self.spread
         ones = jnp.ones((steps, stages, 1))
         moved = jnp.concatenate([z[..., np.array(self.scheduled, dtype=int)], ones], axis=2)
@@ -315,7 +276,6 @@ class Parametrization(eqx.Module):
     def _linear(self, scheduled: jax.Array, constant: jax.Array) -> LinearModel:
         f = self.model.f
         mean, std = self._moments
-        scheduled = jnp.einsum("kp,prc->krc", self.ties, scheduled)
         change = jnp.zeros((len(f.grid), len(self.rows), len(std)))
         change = change.at[:, :, np.array(self.scheduled, dtype=int)].set(scheduled[..., :-1])
         change = change.at[:, :, self._constant_columns].set(constant * self._free)

@@ -68,10 +68,6 @@ class RefineSettings:
     decay
         Weight of the squared deviations from the start, in which a unit changes a derivative by
         about its own spread, beside the sum of squared errors relative to their spread.
-    freedom
-        How much coefficients may change along the schedule where they are not constant, relative
-        to what changes at all schedule points alike; acts through `decay`. None leaves schedule
-        points unrelated.
     hold_out
         Share of the runs that decide when to stop, at least one; last of all they train, too.
     correlation
@@ -91,7 +87,6 @@ class RefineSettings:
     latent_inputs: tuple[str, ...] | None = None
     network: int = 0
     decay: float = 0.0
-    freedom: float | None = None
     hold_out: float = 0.2
     correlation: float = 0.0
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -109,8 +104,6 @@ class RefineSettings:
         require(some, "refine.latent_inputs", self.latent_inputs, "at least one name, or null")
         require(self.network >= 0, "refine.network", self.network, "a number of units, or 0")
         require(self.decay >= 0, "refine.decay", self.decay, "0 or more")
-        some = self.freedom is None or self.freedom >= 0
-        require(some, "refine.freedom", self.freedom, "0 or more, or null")
         require(self.iterations >= 1, "refine.iterations", self.iterations, "at least 1")
         require(0 < self.hold_out < 1, "refine.hold_out", self.hold_out, "a share between 0 and 1")
         good = 0 <= self.correlation < 1
@@ -215,7 +208,7 @@ def refine(
         return settings.seconds is not None and clock.perf_counter() - began > settings.seconds
 
     spread = np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in train_runs], axis=0))
-    parameters = Parametrization.of(model, spread, settings.freedom)
+    parameters = Parametrization.of(model, spread)
     final = RolloutError(parameters, held, settings.windows[-1], weights)
     at = np.zeros(parameters.size)
     before = after = final.relative(at)
@@ -226,7 +219,7 @@ def refine(
     if settings.network and model.e is None:
         started = start_network(started, settings.network, spread, seed)
     if started is not model:
-        parameters = Parametrization.of(started, spread, settings.freedom)
+        parameters = Parametrization.of(started, spread)
         final = RolloutError(parameters, held, settings.windows[-1], weights)
         at = np.zeros(parameters.size)
     best, samples = at, sum(r.states[1:].size for r in train_runs)
