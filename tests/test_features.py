@@ -64,6 +64,20 @@ def test_names_and_units():
     assert {run.channel(n).role for n in ("w_dot", "w_lag1.5")} == {"disturbance"}
 
 
+def test_a_difference_is_one():
+    run = driven(0)
+    channels = (Channel("v", "m"), Channel("f", "Hz"))
+    wide = run.with_channels(channels, np.stack([run["w"] ** 2, run["w"]], axis=1))
+    made = with_features(wide, [Feature(source="v", kind="difference", less="w")])
+    np.testing.assert_array_equal(made["v-w"], run["w"] ** 2 - run["w"])
+    assert made.channel("v-w").unit == "m"
+    with pytest.raises(DfsmError, match=r"takes 'f' \(Hz\) off 'v' \(m\): name two channels in"):
+        with_features(wide, [Feature(source="v", kind="difference", less="f")])
+    for wrong in ({"kind": "difference"}, {"less": "w"}):
+        with pytest.raises(DfsmError, match=r"features\.less"):
+            Feature(source="v", **wrong)
+
+
 def test_a_rate_is_the_derivative():
     w = np.sin(TIME)
     run = Trajectory(TIME, w[:, None], (Channel("w", "m"),))

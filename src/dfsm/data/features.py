@@ -1,4 +1,4 @@
-"""Inputs computed from disturbances: a rate, or a copy that lags behind.
+"""Inputs computed from disturbances: a rate, a copy that lags behind, or a difference.
 
 A force often follows from the history of a disturbance: wave forces from the elevation and its
 rate, the induced wind from the wind of the last seconds. Declared features are computed from a
@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
+from dfsm.core.units import plain
 from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -23,7 +24,7 @@ from dfsm.numerics.smoothing import smoothing_spline
 
 @settings_class
 class Feature:
-    """A disturbance made of another one.
+    """A disturbance made of others.
 
     Attributes
     ----------
@@ -32,14 +33,19 @@ class Feature:
     kind
         ``"rate"``: the time derivative, by the same smoothing spline as derivatives of states;
         named ``<source>_dot``. ``"lag"``: a first-order lag, ``τ dz/dt = source - z``, at rest when
-        the record starts; named ``<source>_lag<τ>``.
+        the record starts; named ``<source>_lag<τ>``. ``"difference"``: source less another
+        disturbance in the same unit, e.g. the wind over a ring of the rotor less that over the
+        disk; named ``<source>-<less>``.
     time_constant
         τ of a lag in s.
+    less
+        What a difference takes off.
     """
 
     source: str
-    kind: Literal["rate", "lag"] = "rate"
+    kind: Literal["rate", "lag", "difference"] = "rate"
     time_constant: float | None = None
+    less: str | None = None
 
     def __post_init__(self) -> None:
         if self.kind == "lag":
@@ -51,14 +57,24 @@ class Feature:
                 self.time_constant is None,
                 "features.time_constant",
                 self.time_constant,
-                "none for a rate",
+                f"none for a {self.kind}",
             )
+        right = (self.less is not None) == (self.kind == "difference")
+        expected = "a disturbance" if self.kind == "difference" else f"none for a {self.kind}"
+        require(right, "features.less", self.less, expected)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Channels that it is made of."""
+        return (self.source,) if self.less is None else (self.source, self.less)
 
     @property
     def name(self) -> str:
         """Name of the channel."""
         if self.kind == "rate":
             return f"{self.source}_dot"
+        if self.kind == "difference":
+            return f"{self.source}-{self.less}"
         return f"{self.source}_lag{self.time_constant:g}"
 
 
@@ -80,20 +96,31 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
     Raises
     ------
     DfsmError
-        The source is missing or not finite, or a lag is asked for on a mesh that is not
-        equidistant.
+        A source is missing or not finite, a lag is asked for on a mesh that is not equidistant,
+        or the two of a difference have different units.
     """
     for feature in features:
-        run.columns([feature.source])
-        source = run.select([feature.source]).require_finite().channels[0]
+        run.columns(feature.sources)
+        source, *others = run.select(feature.sources).require_finite().channels
         if feature.kind == "rate":
             values, unit = _rate(run, feature), per_second(source.unit)
-        else:
+        elif feature.kind == "lag":
             values, unit = _lagged(run, feature), source.unit
+        else:
+            _require_one_unit(run, source, others[0])
+            values, unit = run[source.name] - run[others[0].name], source.unit
         channel = Channel(feature.name, unit, role="disturbance", computed=True)
         run = run.select(n for n in run.names if n != feature.name)
         run = run.with_channels([channel], values)
     return run
+
+
+def _require_one_unit(run: Trajectory, source: Channel, other: Channel) -> None:
+    if plain(source.unit) != plain(other.unit):
+        raise DfsmError(
+            f"{run.where}: a feature takes '{other.name}' ({other.unit}) off '{source.name}' "
+            f"({source.unit}): name two channels in one unit"
+        )
 
 
 def _rate(run: Trajectory, feature: Feature) -> Array:

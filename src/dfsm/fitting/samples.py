@@ -105,7 +105,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     names = dict.fromkeys(roles)
     if settings.azimuth is not None and settings.azimuth.angle is not None:
         names[settings.azimuth.angle] = None
-    names.update(dict.fromkeys(f.source for f in settings.features))
+    names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
     for run in picked:

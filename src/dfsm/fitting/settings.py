@@ -16,6 +16,8 @@ from dfsm.fitting.linear import LPV, LTI
 from dfsm.models.signals import Azimuth
 from dfsm.models.terms import TermSettings
 
+_DISTURBANCE: Role = "disturbance"
+
 
 @settings_class
 class FitSettings:
@@ -109,10 +111,12 @@ class FitSettings:
                     )
                 roles.setdefault(name, role)
         for feature in self.features:
-            role = roles.get(feature.source, "disturbance")
-            if role != "disturbance":
+            source = next(
+                (n for n in feature.sources if roles.get(n, _DISTURBANCE) != _DISTURBANCE), None
+            )
+            if source is not None:
                 raise DfsmError(
-                    f"feature '{feature.name}' is made of the {role} '{feature.source}', but a "
+                    f"feature '{feature.name}' is made of the {roles[source]} '{source}', but a "
                     "rollout may know no responses and an optimizer must be free to choose "
                     "controls: make features of disturbances only"
                 )
