@@ -11,6 +11,7 @@ import sys
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
@@ -120,6 +121,24 @@ def test_unknown_keywords_are_refused(name):
     assert not [p for p in inspect.signature(value).parameters.values() if p.kind is p.VAR_KEYWORD]
 
 
+# What settings need that is no text.
+_GRID = np.ones((2, 2))
+VALID = {
+    "Filter": {"window": 1.0},
+    "BoxSettings": {"points": (4, 4, 4), "spacing": (1.0, 1.0, 1.0), "mean_wind": 8.0, "hub_height": 90.0},
+    "RotorTable": {
+        "pitch": np.array([0.0, 1.0]),
+        "tip_speed_ratio": np.array([5.0, 6.0]),
+        "cp": 0.4 * _GRID,
+        "ct": 0.8 * _GRID,
+        "cq": 0.4 * _GRID / np.array([[5.0], [6.0]]),
+    },
+    "Rotor": {"radius": 60.0, "wind": "w", "speed": "s", "pitch": "p"},
+    "Product": {"factors": ("a", "b")},
+    "Function": {"function": lambda x: x, "inputs": ("a",)},
+}
+
+
 @pytest.mark.parametrize("name", [n for n in CLASSES if hasattr(OBJECTS[n], "__pydantic_config__")])
 def test_settings_are_frozen_and_keyword_only(name):
     cls = OBJECTS[name]
@@ -130,7 +149,7 @@ def test_settings_are_frozen_and_keyword_only(name):
         for f in dataclasses.fields(cls)
         if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
     }
-    value = cls(**required, **({"window": 1.0} if name == "Filter" else {}))
+    value = cls(**(required | VALID.get(name, {})))
     with pytest.raises(dataclasses.FrozenInstanceError):
         setattr(value, dataclasses.fields(cls)[0].name, 1)
 

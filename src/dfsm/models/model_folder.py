@@ -95,7 +95,10 @@ def load_all(
 ) -> dict[str, DFSM]:
     """Read all models of a model folder by name: multi-fidelity, and nonlinear-only if kept.
 
-    The arguments are those of `load`.
+    Parameters
+    ----------
+    path, functions
+        As for `load`.
     """
     path = Path(path)
     manifest = _read_manifest(path)
