@@ -1,7 +1,7 @@
 """Run the measurements and print one JSON object.
 
-python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [limits]
-    [matched] [control] [codesign] [peer]
+python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [unseen]
+    [limits] [matched] [control] [codesign] [peer]
 
 Without names all but `peer`, which makes an environment of its own and installs jax-sysid there.
 """
@@ -27,6 +27,7 @@ from benchmarks import (
     rollouts,
     scaling,
     speed,
+    unseen,
 )
 from dfsm.core.files import json_value
 
@@ -37,6 +38,7 @@ PARTS = {
     "parameters": parameters.run,
     "scaling": scaling.run,
     "rollouts": rollouts.run,
+    "unseen": unseen.run,
     "limits": limits.run,
     "matched": matched.run,
     "control": control.run,

@@ -9,7 +9,12 @@ from typing import Any
 
 def demo() -> ModuleType:
     """The demo as a module."""
-    return importlib.import_module("demo")
+    return neighbour("demo")
+
+
+def neighbour(name: str) -> ModuleType:
+    """A script of the turbine's examples as a module."""
+    return importlib.import_module(name)
 
 
 def run(*labels: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import control_tables, fit_tables, turbine_tables
+from benchmarks import control_tables, fit_tables, turbine_tables, unseen
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -24,6 +24,7 @@ TABLES = {
     "derivatives": fit_tables.derivatives_table,
     "parameters": fit_tables.parameters_table,
     "scaling": fit_tables.scaling_table,
+    "unseen": unseen.unseen_table,
 }
 ROLLOUT_TABLES = {
     "rollouts": turbine_tables.rollouts_table,

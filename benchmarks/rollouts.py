@@ -141,7 +141,7 @@ def errors(models: Sequence[dfsm.DFSM], runs: Sequence[dfsm.Trajectory]) -> dict
     """What `judged` says of rollouts; with several models, each run has that of its wind speed."""
     states = []
     for run in runs:
-        model = models[WINDS.index(run.name.split("_")[2]) % len(models)]
+        model = models[0 if len(models) == 1 else WINDS.index(run.name.split("_")[2])]
         rollout = dfsm.simulate(model, run, start=demo().START)
         completed = rollout.status is dfsm.Status.COMPLETED
         states.append(rollout.trajectory.select(STATES).values if completed else None)

@@ -122,16 +122,21 @@ def test_unknown_keywords_are_refused(name):
 
 
 # What settings need that is no text.
-_GRID = np.ones((2, 2))
+_RATIOS, _GRID = np.arange(5.0, 10.0), np.ones((5, 5))
 VALID = {
     "Filter": {"window": 1.0},
-    "BoxSettings": {"points": (4, 4, 4), "spacing": (1.0, 1.0, 1.0), "mean_wind": 8.0, "hub_height": 90.0},
+    "BoxSettings": {
+        "points": (4, 4, 4),
+        "spacing": (1.0, 1.0, 1.0),
+        "mean_wind": 8.0,
+        "hub_height": 90.0,
+    },
     "RotorTable": {
-        "pitch": np.array([0.0, 1.0]),
-        "tip_speed_ratio": np.array([5.0, 6.0]),
+        "pitch": np.arange(5.0),
+        "tip_speed_ratio": _RATIOS,
         "cp": 0.4 * _GRID,
         "ct": 0.8 * _GRID,
-        "cq": 0.4 * _GRID / np.array([[5.0], [6.0]]),
+        "cq": 0.4 * _GRID / _RATIOS[:, None],
     },
     "Rotor": {"radius": 60.0, "wind": "w", "speed": "s", "pitch": "p"},
     "Product": {"factors": ("a", "b")},
