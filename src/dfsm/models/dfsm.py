@@ -3,9 +3,9 @@
     f̂(I) = f̂_L(I, φ; s) + e(I)     ĝ(I) = ĝ_L(I, φ; s) + e_g(I)     I = [u, w, ξ, p],  φ = φ(I)
 
 The linear parts are defined for every row, with known terms φ among their inputs where there are
-any; the corrective functions only for the rows that need one (Sec. 3.1, 3.4, 3.6, 3.7).
-Everything that evaluates a model goes through `derivative` and `output`, so simulation, Jacobians
-and optimization see the same function.
+any; the corrective functions only for the rows that need one (Sec. 3.1, 3.4, 3.6, 3.7). To ĝ comes
+what blades meet that turn in a wind field, see `passing`. Everything that evaluates a model goes
+through `derivative` and `output`, so simulation, Jacobians and optimization see the same function.
 """
 
 from __future__ import annotations

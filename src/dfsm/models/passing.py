@@ -1,11 +1,10 @@
 """Blade-passing loads: what blades meet that turn in a wind field, as a part of ĝ.
 
-Over a ring of radius r the field is u(α) = Re Σₙ q_n e^{inα} with q_n = Cn - i Sn (q_0 = U). A blade
-at α = d ψ + const, d = ±1 the direction of ψ in α, meets Re Σₙ q_n e^{indψ}; what three blades
-add up to at the hub, or yaw and tilt of the rotor modulate, are products q_n e^{ikdψ} whose k is a
-multiple of the number of blades, or next to n. So
+Over a ring of radius r the field is u(α) = Re Σₙ q_n e^{inα} with q_n = Cn - i Sn, q_0 = U. A blade
+at α = d ψ, d = ±1 the direction of ψ in α, meets Re Σₙ q_n e^{indψ}, of which yaw and tilt move a
+part to neighbours of n; what three blades add up to at the tower has k = 3 and n = 2, 3, 4. So
 
-    y = … + Σ_k Σ_n Σ_r Re[ (a + b ω + c ω s) q_n(r) e^{ikdψ} ],   and e^{ikdψ} alone beside the q_n.
+    y = … + Re Σ_k e^{ikdψ} [ p_k + Σ_n Σ_r p_knr q_n(r) ],      p = a + b ω + c ω s.
 
 A gust changes the lift of a blade element by its speed times the gust, hence the rotor's speed ω;
 pitch and the rest change with the schedule s. ψ is the rollout's own: it drifts away from the

@@ -70,7 +70,7 @@ class Azimuth:
         )  # fmt: skip
         require(
             self.angle is not None or not self.rings,
-            "azimuth.angle", "not set", "the channel with the recorded azimuth beside azimuth.rings",
+            "azimuth.angle", "not set", "the recorded azimuth's channel beside azimuth.rings",
         )  # fmt: skip
         if self.orders is None:
             return
@@ -264,15 +264,14 @@ def require_field(run: Trajectory, azimuth: Azimuth | None) -> None:
         highest = max((n for tried in azimuth.tried.values() for n in tried), default=0)
         raise DfsmError(
             f"{run.where} lacks {missing[0]}{' and others' if missing[1:] else ''}, harmonics of "
-            "the wind field that blade-passing loads follow from: add them with dfsm wind "
-            f"(--harmonics {max(1, highest)} --rings {rings}) from the field that drove the run, or "
-            "fit a model without azimuth.rings"
+            "the wind field that make its blade-passing loads: add them with dfsm wind "
+            f"(--harmonics {max(1, highest)} --rings {rings}) from the field that drove the run, "
+            "or use a model without azimuth.rings"
         )
     if azimuth.angle not in run:
         raise DfsmError(
             f"{run.where} lacks azimuth.angle '{azimuth.angle}', without which nobody knows where "
-            "in the wind field the blades are: "
-            + near_matches(str(azimuth.angle), run.names)
+            "in the wind field the blades are: " + near_matches(str(azimuth.angle), run.names)
         )
 
 
