@@ -243,9 +243,9 @@ def unexplained(model: DFSM, samples: Samples) -> list[str]:
     if not poor:
         return []
     return [
-        f"cos {k}ψ and sin {k}ψ explain little of the {k}P band ({', '.join(poor)}): most of these "
-        "loads comes from the wind field that blades turn in; dfsm wind adds its harmonics to runs, "
-        "for azimuth.rings"
+        f"cos {k}ψ and sin {k}ψ explain little of the {k}P band ({', '.join(poor)}): most of such "
+        "loads comes from the wind field that blades turn in; dfsm wind adds its harmonics to "
+        "runs, for azimuth.rings"
     ]
 
 

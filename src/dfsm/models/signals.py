@@ -45,8 +45,9 @@ class Azimuth:
         see `data.wind_field`): outputs then follow what blades meet in it. None by default.
     orders
         With rings: which azimuthal harmonics n of the field are tried at which multiple k of the
-        rotor's speed, ``{3: (2, 3, 4)}``. None tries n = k - 1, k, k + 1 at k = 1, 2 and the number
-        of blades; what explains nothing on runs left out is dropped, output by output.
+        rotor's speed, ``{3: (2, 3, 4)}``. None tries n = k - 1, k, k + 1 at k = 1 to one more than
+        the number of blades, no n beyond that; what explains nothing on runs left out is dropped,
+        output by output.
     direction
         Which way ψ turns in the field's angle α: -1 where blade 1 is at α = -ψ, as in OpenFAST, 1
         where it is at α = ψ.
@@ -88,7 +89,10 @@ class Azimuth:
             return {}
         if self.orders is not None:
             return {k: tuple(n) for k, n in sorted(self.orders.items())}
-        return {k: (k - 1, k, k + 1) for k in sorted({1, 2, self.blades})}
+        highest = self.blades + 1
+        return {
+            k: tuple(n for n in (k - 1, k, k + 1) if n <= highest) for k in range(1, highest + 1)
+        }
 
     @property
     def field(self) -> tuple[str, ...]:
