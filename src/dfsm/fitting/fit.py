@@ -150,12 +150,14 @@ def fit(
         corrected_outputs=e_g.rows if e_g else (),
     )
     passing: list[dict[str, Any]] = []
-    if model.signals.field:
-        with _timed(seconds, "blade passing"):
-            model, passing = fit_passing(model, seen, data)
+    with _timed(seconds, "blade passing"):
+        if model.signals.field:
+            model, passing, more = fit_passing(model, seen, data)
+        else:
+            more = unexplained(model, seen)
     with _timed(seconds, "checks"):
         notes, checks = _check(model, recorded, data, settings)
-        notes += unexplained(model, seen)
+        notes += more
     notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
     checks = [*f.notes, *checks]
     nonlinear = None
@@ -163,7 +165,7 @@ def fit(
         with _timed(seconds, "nonlinear-only"):
             nonlinear = _fit_nonlinear(samples, region, settings)
             if nonlinear.signals.field:
-                nonlinear, _ = fit_passing(nonlinear, samples, data)
+                nonlinear, *_ = fit_passing(nonlinear, samples, data)
     outputs = e_g.decisions if e_g else []
     for row, account in zip(outputs, passing, strict=False):
         row["passing"] = account["explained"]

@@ -49,6 +49,8 @@ _BLOCKS = 4
 _PRESENT = 0.01
 # Below this share explained, a note says what is missing.
 _MOST = 0.5
+# RMS of what is left without a field over that of the band, above which inputs cause it.
+_OVERFILLED = 1.15
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,9 @@ class _Multiple:
         return choice if gain >= _WORTHWHILE else None
 
 
-def fit_passing(model: DFSM, samples: Samples, data: Dataset) -> tuple[DFSM, list[dict[str, Any]]]:
+def fit_passing(
+    model: DFSM, samples: Samples, data: Dataset
+) -> tuple[DFSM, list[dict[str, Any]], list[str]]:
     """Add to a model what the wind field does to its outputs as blades pass.
 
     Parameters
@@ -178,8 +182,8 @@ def fit_passing(model: DFSM, samples: Samples, data: Dataset) -> tuple[DFSM, lis
     Returns
     -------
     tuple
-        The model, and per output a dictionary of JSON values: ``explained`` (share of every band,
-        of which the field's harmonics explain a part, on runs left out) and ``text``.
+        The model; per output a dictionary of JSON values: ``explained`` (share of every band that
+        has harmonics of the field, on runs left out) and ``text``; at most one warning.
 
     Raises
     ------
@@ -189,7 +193,7 @@ def fit_passing(model: DFSM, samples: Samples, data: Dataset) -> tuple[DFSM, lis
     azimuth = model.signals.azimuth
     turn = model.signals.azimuth_rate
     if azimuth is None or turn is None or model.g is None or not samples.outputs.shape[1]:
-        return model, []
+        return model, [], []
     column = model.signals.state_columns.start + turn[0]
     speed = float(np.abs(samples.inputs[:, column]).mean())
     schedule = _schedule(model, samples.inputs)
@@ -219,7 +223,8 @@ def fit_passing(model: DFSM, samples: Samples, data: Dataset) -> tuple[DFSM, lis
             first += width
         accounts.append(_account(multiples, chosen, i))
     passing = Passing(jnp.asarray(C), jnp.asarray(speed), jnp.asarray(ends), column)
-    return replace(model, passing=passing), accounts
+    notes = _overfilled(multiples.get(azimuth.blades), azimuth.blades, samples)
+    return replace(model, passing=passing), accounts, notes
 
 
 def unexplained(model: DFSM, samples: Samples) -> list[str]:
@@ -232,13 +237,11 @@ def unexplained(model: DFSM, samples: Samples) -> list[str]:
     sums = _Parts(samples, residuals, np.ones((len(residuals), 1)), ()).around(k)
     if sums is None:
         return []
-    shares, spread = 1 - sums.residual / np.maximum(sums.total, 1e-300), samples.outputs.std(0)
-    there = np.sqrt(sums.total / max(sums.count, 1)) > _PRESENT * spread
-    names = [c.name for c in model.signals.outputs]
+    shares = 1 - sums.residual / np.maximum(sums.total, 1e-300)
     poor = [
         f"{max(share, 0):.0%} for {name}"
-        for name, share, present in zip(names, shares, there, strict=True)
-        if present and share < _MOST
+        for name, share in zip(_present(sums, samples), shares, strict=True)
+        if name and share < _MOST
     ]
     if not poor:
         return []
@@ -247,6 +250,31 @@ def unexplained(model: DFSM, samples: Samples) -> list[str]:
         "loads comes from the wind field that blades turn in; dfsm wind adds its harmonics to "
         "runs, for azimuth.rings"
     ]
+
+
+def _overfilled(multiple: _Multiple | None, k: int, samples: Samples) -> list[str]:
+    """Where ĝ has more in the band of blade passing than there is, before the field comes in."""
+    if multiple is None:
+        return []
+    sums = multiple.whole
+    left = np.sqrt(sums.residual / np.maximum(sums.total, 1e-300))
+    names = _present(sums, samples)
+    poor = {n: v for n, v in zip(names, left, strict=True) if n and v > _OVERFILLED}
+    if not poor:
+        return []
+    worst = max(poor, key=lambda n: poor[n])
+    return [
+        f"without the wind field the model leaves {poor[worst]:.1f} times the {k}P band of "
+        f"{worst}: an input reaches too far up in frequency (rates among the features do, "
+        "lags of the same channel do not)"
+    ]
+
+
+def _present(sums: _Sums, samples: Samples) -> list[str]:
+    """Names of the outputs that have a load in a band, empty for the others."""
+    there = np.sqrt(sums.total / max(sums.count, 1)) > _PRESENT * samples.outputs.std(0)
+    names = samples.signals.names("outputs")
+    return [name if t else "" for name, t in zip(names, there, strict=True)]
 
 
 # -- sums over the samples ----------------------------------------------------------------------
@@ -351,19 +379,25 @@ def _schedule(model: DFSM, inputs: Array) -> Array:
 
 def _check_direction(parts: _Parts, multiples: dict[int, _Multiple], azimuth: Azimuth) -> None:
     """Refuse an azimuth that turns the other way in the field than the settings say."""
-    other = replace(azimuth, direction=1 if azimuth.direction == -1 else -1)
 
-    def shares(multiples: dict[int, _Multiple]) -> Array:
+    def shares(multiples: dict[int, _Multiple], turning: bool) -> Array:
+        """What harmonics explain, without those that are the same either way unless `turning`."""
         return np.array(
             [
-                max(m.explained(_Choice(m.orders, 1, _RIDGES[1]), i), 0)
+                max(m.explained(_Choice(orders, 1, _RIDGES[1]), i), 0)
                 for m in multiples.values()
-                for i in range(len(m.whole.total))
+                for orders in [tuple(n for n in m.orders if turning or n == 0)]
+                for i in range(parts.residuals.shape[1])
             ]
         )
 
-    told, turned = shares(multiples), shares(parts.multiples(other))
-    if not len(told) or (turned - told).max() < _CLEARLY or (told - turned).max() >= _CLEARLY:
+    told = shares(multiples, True)
+    # Only the right way can they explain anything: the other is tried where they do not.
+    if not len(told) or (told - shares(multiples, False)).max() >= _CLEARLY:
+        return
+    other = replace(azimuth, direction=-azimuth.direction)
+    turned = shares(parts.multiples(other), True)
+    if (turned - told).max() < _CLEARLY:
         return
     best = int(np.argmax(turned - told))
     outputs = parts.samples.signals.names("outputs")

@@ -307,6 +307,11 @@ class DFSM(eqx.Module):
             for group in ("states", "controls", "disturbances", "parameters", "outputs")
             if getattr(s, group)
         ]
+        if s.azimuth is not None and s.azimuth.rings:
+            rings = ", ".join(f"{r:g}" for r in s.azimuth.rings)
+            lines.append(
+                f"wind field, for outputs: {len(s.field)} harmonics over rings of {rings} m"
+            )
         kind = f"LPV in {self.schedule}, {len(self.f.grid)} points" if self.schedule else "LTI"
         lines.append(f"linear fit: {kind}, condition number {record.get('condition', np.nan):.3g}")
         for row in record.get("rows", []):
