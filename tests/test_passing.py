@@ -285,6 +285,18 @@ def test_a_refined_model_and_a_nonlinear_one_have_them_too():
         assert power == pytest.approx(1, abs=0.1)
 
 
+def test_the_speed_may_be_the_rate_of_a_measured_angle():
+    turning = []
+    for run in runs()[:2]:
+        turned = Channel("turned", "rad")
+        psi = np.unwrap(np.deg2rad(run["psi"]))
+        turning.append(run.with_channels([turned], psi[:, None]))
+    states = (StateSpec(name="turned", order=2),)
+    azimuth = replace(FIELD, speed="turned_dot")
+    told = rows(fit(turning, replace(SETTINGS, states=states, azimuth=azimuth)))
+    assert told["tower"]["passing"]["3P"] > 0.9
+
+
 # -- evaluation and simulation ------------------------------------------------------------------
 
 

@@ -160,6 +160,7 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
 
 def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
+    signals = _signals(data, settings)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
     for run in track(data, "derivatives"):
@@ -171,24 +172,25 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
-        azimuth, psi = settings.azimuth, _azimuth(run, settings.azimuth)
-        own = azimuth is not None and not azimuth.rings
+        azimuth, psi = settings.azimuth, _azimuth(whole, settings.azimuth)[rows]
+        harmonics = np.empty((len(psi), 0))
+        if azimuth is not None and not azimuth.rings:
+            harmonics = np.asarray(blade_harmonics(psi, azimuth.blades))
         parts.append(
             [
                 inside.select(order.names).values,
                 extracted.derivatives[rows],
                 run.select(settings.outputs).values[rows],
-                np.asarray(blade_harmonics(psi, azimuth.blades if own else 1))[rows][:, : 2 * own],
+                harmonics,
                 run.select(azimuth.field if azimuth else ()).values[rows],
                 run.time[rows],
-                psi[rows],
+                psi,
             ]
         )
     lengths = [len(p[0]) for p in parts]
     inputs, derivatives, outputs, harmonics, field, time, psi = (
         np.concatenate(c) for c in zip(*parts, strict=True)
     )
-    signals = _signals(data, settings)
     return Samples(
         inputs=inputs,
         derivatives=derivatives,

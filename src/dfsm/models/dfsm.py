@@ -160,7 +160,9 @@ class DFSM(eqx.Module):
             return jnp.zeros(self._count_harmonics())
         if not azimuth.rings:
             return blade_harmonics(psi, azimuth.blades)
-        names, shape = self.signals.names("field"), None if field is None else jnp.shape(field)
+        names = self.signals.names("field")
+        field = None if field is None else jnp.asarray(field)
+        shape = None if field is None else field.shape
         if field is None or not shape or shape[-1] != len(names):
             raise DfsmError(
                 f"the wind field has shape {shape}, expected the last axis to hold its "

@@ -272,10 +272,10 @@ def require_field(run: Trajectory, azimuth: Azimuth | None) -> None:
             f"(--harmonics {max(1, highest)} --rings {rings}) from the field that drove the run, "
             "or use a model without azimuth.rings"
         )
-    if azimuth.angle not in run:
+    if azimuth.angle is not None and azimuth.angle not in run:
         raise DfsmError(
             f"{run.where} lacks azimuth.angle '{azimuth.angle}', without which nobody knows where "
-            "in the wind field the blades are: " + near_matches(str(azimuth.angle), run.names)
+            "in the wind field the blades are: " + near_matches(azimuth.angle, run.names)
         )
 
 
