@@ -179,7 +179,12 @@ def harmonic_names(rings: Sequence[float], harmonics: int) -> list[str]:
         How often the highest one goes up and down around a ring.
     """
     around = [f"{part}{n}" for n in range(1, harmonics + 1) for part in "CS"]
-    return [f"{part}_r{r:03g}" for r in rings for part in ("U", *around)] + [*DISK]
+    return [ring_channel(part, r) for r in rings for part in ("U", *around)] + [*DISK]
+
+
+def ring_channel(part: str, ring: float) -> str:
+    """Name of the average ``U``, or of ``C2``, ``S2``, … over a ring of some radius in m."""
+    return f"{part}_r{ring:03g}"
 
 
 def _blocks(field: WindField) -> Iterator[Array]:

@@ -31,6 +31,7 @@ from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.gate import correct
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
 from dfsm.fitting.samples import Samples, data_warnings, extract, select
@@ -148,15 +149,28 @@ def fit(
         e_g=e_g.function if e_g else None,
         corrected_outputs=e_g.rows if e_g else (),
     )
+    passing: list[dict[str, Any]] = []
+    with _timed(seconds, "blade passing"):
+        if model.signals.field:
+            model, passing, more = fit_passing(model, seen, data)
+        else:
+            more = unexplained(model, seen)
     with _timed(seconds, "checks"):
         notes, checks = _check(model, recorded, data, settings)
+        notes += more
     notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
     checks = [*f.notes, *checks]
     nonlinear = None
     if settings.nonlinear_only and not isinstance(settings.corrective, NoCorrection):
         with _timed(seconds, "nonlinear-only"):
             nonlinear = _fit_nonlinear(samples, region, settings)
-    decisions = [*e.decisions, *(e_g.decisions if e_g else [])]
+            if nonlinear.signals.field:
+                nonlinear, *_ = fit_passing(nonlinear, samples, data)
+    outputs = e_g.decisions if e_g else []
+    for row, account in zip(outputs, passing, strict=False):
+        row["passing"] = account["explained"]
+        row["decision"] += f"; {account['text']}"
+    decisions = [*e.decisions, *outputs]
     record = dict(model.provenance.record) | _record(
         data, settings, f, decisions, notes, checks, seconds
     )

@@ -28,9 +28,13 @@ from dfsm.models.signals import (
     blade_harmonics,
     radians_per_second,
     require_constant,
+    require_field,
     with_computed,
 )
 from dfsm.models.terms import Terms, terms_of
+
+# Share by which the recorded azimuth may turn faster or slower than the speed says.
+_SAME_SPEED = 0.05
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,12 @@ class Samples:
     Attributes
     ----------
     inputs, derivatives, outputs, harmonics
-        I, Ẋ, Y and the blade-passing harmonics, shapes ``(sample, n)``.
+        I, Ẋ, Y and the blade-passing harmonics without a field, shapes ``(sample, n)``.
+    field
+        Harmonics of the wind field, `SignalTable.field`, shape ``(sample, n)``.
+    time, psi
+        Time of each run in s and recorded azimuth in rad, which goes on growing after a turn (zero
+        without), ``(sample,)``.
     runs
         Run index of each sample, shape ``(sample,)``.
     signals
@@ -55,6 +64,9 @@ class Samples:
     derivatives: Array
     outputs: Array
     harmonics: Array
+    field: Array
+    time: Array
+    psi: Array
     runs: IntArray
     signals: SignalTable
     derivative_names: tuple[tuple[str, str], ...]
@@ -107,6 +119,10 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         names[settings.azimuth.angle] = None
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
+    if settings.azimuth is not None:
+        names.update(dict.fromkeys(settings.azimuth.field))
+        for run in runs:
+            require_field(run, settings.azimuth)
     picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
     for run in picked:
         run.window(settings.start, settings.stop)
@@ -144,6 +160,7 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
 
 def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
+    signals = _signals(data, settings)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
     for run in track(data, "derivatives"):
@@ -155,22 +172,33 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
+        azimuth, psi = settings.azimuth, _azimuth(whole, settings.azimuth)[rows]
+        harmonics = np.empty((len(psi), 0))
+        if azimuth is not None and not azimuth.rings:
+            harmonics = np.asarray(blade_harmonics(psi, azimuth.blades))
         parts.append(
             [
                 inside.select(order.names).values,
                 extracted.derivatives[rows],
                 run.select(settings.outputs).values[rows],
-                _harmonics(run, settings.azimuth)[rows],
+                harmonics,
+                run.select(azimuth.field if azimuth else ()).values[rows],
+                run.time[rows],
+                psi,
             ]
         )
     lengths = [len(p[0]) for p in parts]
-    inputs, derivatives, outputs, harmonics = (np.concatenate(c) for c in zip(*parts, strict=True))
-    signals = _signals(data, settings)
+    inputs, derivatives, outputs, harmonics, field, time, psi = (
+        np.concatenate(c) for c in zip(*parts, strict=True)
+    )
     return Samples(
         inputs=inputs,
         derivatives=derivatives,
         outputs=outputs,
         harmonics=harmonics,
+        field=field,
+        time=time,
+        psi=psi,
         runs=np.repeat(np.arange(len(data)), lengths),
         signals=signals,
         derivative_names=labels,
@@ -199,17 +227,36 @@ def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
         azimuth=settings.azimuth,
         hub_height=settings.hub_height,
         features=settings.features,
+        field=channels(settings.azimuth.field if settings.azimuth else (), "disturbance"),
     )
     _ = table.azimuth_rate  # fails here, not in the middle of a simulation
     return table
 
 
-def _harmonics(run: Trajectory, azimuth: Azimuth | None) -> Array:
+def _azimuth(run: Trajectory, azimuth: Azimuth | None) -> Array:
+    """Azimuth in rad that goes on growing after a turn, ``(time,)``; zero where nobody asks.
+
+    Raises
+    ------
+    DfsmError
+        With a wind field, in which angle and speed must agree: they do not.
+    """
     if azimuth is None:
-        return np.empty((len(run), 0))
-    if azimuth.angle is not None:
-        psi = np.deg2rad(run[azimuth.angle])
-    else:
-        omega = run[azimuth.speed] * radians_per_second(run.channel(azimuth.speed))
-        psi = cumulative_trapezoid(omega, run.time, initial=0.0)
-    return np.asarray(blade_harmonics(psi, azimuth.blades))
+        return np.zeros(len(run))
+    omega = run[azimuth.speed] * radians_per_second(run.channel(azimuth.speed))
+    turned = cumulative_trapezoid(omega, run.time, initial=0.0)
+    if azimuth.angle is None:
+        return turned
+    angle = np.deg2rad(run[azimuth.angle])
+    # Whole turns are those of the speed: several may lie between two samples.
+    steps, whole = np.diff(angle), 2 * np.pi
+    steps += whole * np.round((np.diff(turned) - steps) / whole)
+    psi = angle[0] + np.concatenate([[0.0], np.cumsum(steps)])
+    ratio = (psi[-1] - psi[0]) / turned[-1] if turned[-1] else 1.0
+    if azimuth.rings and abs(ratio - 1) > _SAME_SPEED and abs(turned[-1]) > whole:
+        raise DfsmError(
+            f"{run.where}: azimuth.angle '{azimuth.angle}' turns by {ratio:.3g} times what "
+            f"azimuth.speed '{azimuth.speed}' says: name the rotor's speed, and its azimuth in deg "
+            "that grows with it"
+        )
+    return psi

@@ -3,9 +3,9 @@
     f̂(I) = f̂_L(I, φ; s) + e(I)     ĝ(I) = ĝ_L(I, φ; s) + e_g(I)     I = [u, w, ξ, p],  φ = φ(I)
 
 The linear parts are defined for every row, with known terms φ among their inputs where there are
-any; the corrective functions only for the rows that need one (Sec. 3.1, 3.4, 3.6, 3.7).
-Everything that evaluates a model goes through `derivative` and `output`, so simulation, Jacobians
-and optimization see the same function.
+any; the corrective functions only for the rows that need one (Sec. 3.1, 3.4, 3.6, 3.7). To ĝ comes
+what blades meet that turn in a wind field, see `passing`. Everything that evaluates a model goes
+through `derivative` and `output`, so simulation, Jacobians and optimization see the same function.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from dfsm.data.trajectory import labels
 from dfsm.errors import DfsmError, printable
 from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
+from dfsm.models.passing import Passing, field_harmonics, harmonics_of
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance, SignalTable, blade_harmonics
 from dfsm.models.terms import Terms
@@ -51,6 +52,8 @@ class DFSM(eqx.Module):
         Where the training data lie.
     terms
         Known terms φ, which the linear fits take after I; None without.
+    passing
+        Blade-passing loads from the harmonics of a wind field; None without.
     corrected, corrected_outputs
         Row indices that the corrective functions add to.
     signals
@@ -69,6 +72,7 @@ class DFSM(eqx.Module):
     signals: SignalTable = eqx.field(static=True)
     provenance: Provenance = eqx.field(static=True, default_factory=Provenance)
     terms: Terms | None = None
+    passing: Passing | None = None
 
     def __repr__(self) -> str:
         # Without the arrays, which JAX replaces by other things at times.
@@ -113,6 +117,7 @@ class DFSM(eqx.Module):
         disturbances: ArrayLike,
         parameters: ArrayLike = (),
         azimuth: ArrayLike | None = None,
+        field: ArrayLike | None = None,
     ) -> jax.Array:
         """Evaluate ĝ.
 
@@ -123,11 +128,19 @@ class DFSM(eqx.Module):
         azimuth
             Rotor azimuth ψ in rad, shape ``(...)``, for a model with blade-passing harmonics;
             None takes the average over a revolution.
+        field
+            Harmonics of the wind field, shape ``(..., channel)`` as `SignalTable.field`, for a
+            model that follows them.
 
         Returns
         -------
         Array
             Outputs, shape ``(..., output)``.
+
+        Raises
+        ------
+        DfsmError
+            A group has the wrong number of elements, or an azimuth comes without the field.
         """
         order = self.signals.order
         groups = order.arrays(states, controls, disturbances, parameters)
@@ -135,15 +148,34 @@ class DFSM(eqx.Module):
         if self.g is None:
             return jnp.zeros((*inputs.shape[:-1], 0))
         value = order.element(self.g.schedule, *groups)
-        if self.signals.azimuth is None:
-            return _evaluate(self, _output, inputs, value)
-        if azimuth is None:
-            harmonics = jnp.zeros((*inputs.shape[:-1], 2))
-        else:
-            harmonics = blade_harmonics(azimuth, self.signals.azimuth.blades)
+        harmonics = self._harmonics(azimuth, field)
         shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
         parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
         return _evaluate(self, _output, jnp.concatenate(parts, axis=-1), value)
+
+    def _harmonics(self, psi: ArrayLike | None, field: ArrayLike | None) -> jax.Array:
+        """What ĝ takes beside I, shape ``(..., harmonic)``; zero, its mean, without an azimuth."""
+        azimuth = self.signals.azimuth
+        if azimuth is None or psi is None:
+            return jnp.zeros(self._count_harmonics())
+        if not azimuth.rings:
+            return blade_harmonics(psi, azimuth.blades)
+        names = self.signals.names("field")
+        field = None if field is None else jnp.asarray(field)
+        shape = None if field is None else field.shape
+        if field is None or not shape or shape[-1] != len(names):
+            raise DfsmError(
+                f"the wind field has shape {shape}, expected the last axis to hold its "
+                f"{len(names)} harmonics ({', '.join(names[:3])}, …): give field with the azimuth, "
+                "or neither for the average over a revolution"
+            )
+        return field_harmonics(psi, field, azimuth)
+
+    def _count_harmonics(self) -> int:
+        azimuth = self.signals.azimuth
+        if azimuth is None:
+            return 0
+        return 2 * len(harmonics_of(azimuth)) if azimuth.rings else 2
 
     def join(
         self,
@@ -201,7 +233,7 @@ class DFSM(eqx.Module):
             raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
         xs, us = self.signals.state_columns, self.signals.order.driving_columns
         J = np.asarray(_jacobian(self, _derivative, inputs))
-        extra = jnp.zeros(2 if self.signals.azimuth else 0)
+        extra = jnp.zeros(self._count_harmonics())
         G = (
             np.asarray(_jacobian(self, _output, jnp.concatenate([inputs, extra])))
             if self.g is not None
@@ -277,6 +309,11 @@ class DFSM(eqx.Module):
             for group in ("states", "controls", "disturbances", "parameters", "outputs")
             if getattr(s, group)
         ]
+        if s.azimuth is not None and s.azimuth.rings:
+            rings = ", ".join(f"{r:g}" for r in s.azimuth.rings)
+            lines.append(
+                f"wind field, for outputs: {len(s.field)} harmonics over rings of {rings} m"
+            )
         kind = f"LPV in {self.schedule}, {len(self.f.grid)} points" if self.schedule else "LTI"
         lines.append(f"linear fit: {kind}, condition number {record.get('condition', np.nan):.3g}")
         for row in record.get("rows", []):
@@ -311,8 +348,16 @@ def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) 
 def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
     if model.g is None:
         return jnp.zeros(0)
+    n, azimuth = len(model.signals.inputs), model.signals.azimuth
+    harmonics = inputs[n:]
+    if azimuth is not None and azimuth.rings:
+        inputs = inputs[:n]
     wide = _with_terms(model, inputs)
-    return _sum((model.g, model.e_g, model.corrected_outputs), (wide, inputs), value)
+    outputs = _sum((model.g, model.e_g, model.corrected_outputs), (wide, inputs), value)
+    if model.passing is None:
+        return outputs
+    s = inputs[model.g.schedule or 0] if value is None else value
+    return outputs + model.passing(inputs, harmonics, s)
 
 
 def _with_terms(model: DFSM, inputs: jax.Array) -> jax.Array:

@@ -22,6 +22,7 @@ from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
+from dfsm.models.passing import Passing
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance, SignalTable
 from dfsm.models.terms import ScalarFunction, Terms, restored_term, told_term
@@ -151,12 +152,17 @@ def _take_apart(model: DFSM, prefix: str, tensors: dict[str, Array]) -> dict[str
         structure["terms"].append(told_term(term))
     if model.terms is not None:
         keep("terms", model.terms, ("mean", "std"))
+    structure["passing"] = None
+    if model.passing is not None:
+        keep("passing", model.passing, _PASSING)
+        structure["passing"] = {"column": model.passing.column}
     return structure
 
 
 _REGION = ("low", "high", "mean", "std", "grid", "operating", "whitening")
 _NO_DENSITY = np.zeros((0, 0, 0))  # of models that were saved before they had one
 _LINEAR = ("grid", "coefficients", "offsets")
+_PASSING = ("coefficients", "speed", "schedule")
 
 
 def _put_together(
@@ -198,6 +204,10 @@ def _put_together(
         ]
         return Terms(parts=tuple(parts), **arrays("terms"))
 
+    def passing() -> Passing | None:
+        told = structure.get("passing")
+        return None if told is None else Passing(**arrays("passing"), column=int(told["column"]))
+
     region = {field: arrays("region")[field] for field in _REGION}
     f = linear("f")
     if f is None:
@@ -216,6 +226,7 @@ def _put_together(
         signals=signals,
         provenance=provenance,
         terms=terms(),
+        passing=passing(),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature, with_features
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import CORRECTED_WIND, undisturbed_rotor_wind
+from dfsm.data.wind_field import ring_channel
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.inputs import GROUPS, InputOrder
 
@@ -26,7 +27,8 @@ class Azimuth:
     """Blade-passing harmonics of the rotor azimuth ψ = ∫ω dt as inputs of ĝ (Sec. 3.7).
 
     No state holds the blade-passing frequency, so a peak there in an output can only come from
-    these or from the inputs.
+    these or from the inputs. Most of it comes from the wind field that the blades turn in: see
+    `models.passing`.
 
     Attributes
     ----------
@@ -38,14 +40,69 @@ class Azimuth:
         every run to chance.
     blades
         Harmonics are cos(blades ψ) and sin(blades ψ).
+    rings
+        Radii in m of the rings over which runs hold harmonics of the wind field (``C2_r036``, …,
+        see `data.wind_field`): outputs then follow what blades meet in it. None by default.
+    orders
+        With rings: which azimuthal harmonics n of the field are tried at which multiple k of the
+        rotor's speed, ``{3: (2, 3, 4)}``. None tries n = k - 1, k, k + 1 at k = 1 to one more than
+        the number of blades, no n beyond that; what explains nothing on runs left out is dropped,
+        output by output.
+    direction
+        Which way ψ turns in the field's angle α: -1 where blade 1 is at α = -ψ, as in OpenFAST, 1
+        where it is at α = ψ.
     """
 
     speed: str
     angle: str | None = None
     blades: int = 3
+    rings: tuple[float, ...] = ()
+    orders: Mapping[int, tuple[int, ...]] | None = field(default=None, hash=False)
+    direction: Literal[-1, 1] = -1
 
     def __post_init__(self) -> None:
         require(self.blades >= 1, "azimuth.blades", self.blades, "at least 1")
+        require(self.direction in (-1, 1), "azimuth.direction", self.direction, "-1 or 1")
+        shown = [f"{r:g}" for r in self.rings]
+        good = all(r > 0 for r in self.rings) and len({ring_channel("U", r) for r in self.rings})
+        require(
+            not self.rings or good == len(self.rings),
+            "azimuth.rings", f"[{', '.join(shown)}]", "different radii in m above 0",
+        )  # fmt: skip
+        require(
+            self.angle is not None or not self.rings,
+            "azimuth.angle", "not set", "the recorded azimuth's channel beside azimuth.rings",
+        )  # fmt: skip
+        if self.orders is None:
+            return
+        require(bool(self.rings), "azimuth.orders", "set", "no value without azimuth.rings")
+        for k, tried in self.orders.items():
+            where = f"azimuth.orders.{k}"
+            require(k >= 1, "azimuth.orders", f"set for {k}", "multiples of the speed from 1")
+            different = len({*tried}) == len(tried) and all(n >= 0 for n in tried)
+            require(different, where, list(tried), "different numbers from 0")
+
+    @property
+    def tried(self) -> dict[int, tuple[int, ...]]:
+        """Harmonics n of the field by multiple k of the speed; empty without rings."""
+        if not self.rings:
+            return {}
+        if self.orders is not None:
+            return {k: tuple(n) for k, n in sorted(self.orders.items())}
+        highest = self.blades + 1
+        return {
+            k: tuple(n for n in (k - 1, k, k + 1) if n <= highest) for k in range(1, highest + 1)
+        }
+
+    @property
+    def field(self) -> tuple[str, ...]:
+        """Names of the field's channels that ĝ takes: q_n = Cn - i Sn of every ring and n."""
+        return tuple(
+            ring_channel(part, r)
+            for n in sorted({n for tried in self.tried.values() for n in tried})
+            for r in self.rings
+            for part in ((f"C{n}", f"S{n}") if n else ("U",))
+        )
 
 
 @dataclass(frozen=True)
@@ -58,6 +115,8 @@ class SignalTable:
         One `Channel` per element of ξ, u, w, p and y.
     latents
         The last of the states: those that no channel holds, see `latents.py`.
+    field
+        Harmonics of the wind field, which drive ĝ alone; see `Azimuth`.
     specs
         Which states are measured and which are their rates, see `StateSpec`.
     derivatives
@@ -82,6 +141,7 @@ class SignalTable:
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()
     latents: tuple[Channel, ...] = ()
+    field: tuple[Channel, ...] = ()
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
@@ -133,7 +193,7 @@ class SignalTable:
     def recorded(self) -> tuple[str, ...]:
         """Names of the channels that a run holds which the model can be compared with."""
         states = [n for s in self.specs for n in s.channels]
-        return (*self.exogenous, *states, *self.names("outputs"))
+        return (*self.exogenous, *states, *self.names("outputs"), *self.names("field"))
 
     def names(self, group: str) -> tuple[str, ...]:
         """Names of one group, e.g. ``names("states")``."""
@@ -190,6 +250,33 @@ def require_constant(run: Trajectory, parameters: Iterable[str]) -> None:
                 f"{run.where}: parameter '{name}' goes from {low:g} to {high:g}{unit}, but "
                 "parameters are constant within a run: give it as a disturbance or control"
             )
+
+
+def require_field(run: Trajectory, azimuth: Azimuth | None) -> None:
+    """Refuse a run without the harmonics of the wind field, or the azimuth, that outputs take.
+
+    Raises
+    ------
+    DfsmError
+        Names the run, what it lacks and what adds it.
+    """
+    if azimuth is None or not azimuth.rings:
+        return
+    missing = [name for name in azimuth.field if name not in run]
+    rings = ",".join(f"{r:g}" for r in azimuth.rings)
+    if missing:
+        highest = max((n for tried in azimuth.tried.values() for n in tried), default=0)
+        raise DfsmError(
+            f"{run.where} lacks {missing[0]}{' and others' if missing[1:] else ''}, harmonics of "
+            "the wind field that make its blade-passing loads: add them with dfsm wind "
+            f"(--harmonics {max(1, highest)} --rings {rings}) from the field that drove the run, "
+            "or use a model without azimuth.rings"
+        )
+    if azimuth.angle is not None and azimuth.angle not in run:
+        raise DfsmError(
+            f"{run.where} lacks azimuth.angle '{azimuth.angle}', without which nobody knows where "
+            "in the wind field the blades are: " + near_matches(azimuth.angle, run.names)
+        )
 
 
 def radians_per_second(speed: Channel) -> float:

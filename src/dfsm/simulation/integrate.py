@@ -91,11 +91,15 @@ class Case(Generic[Drive]):
         Initial states ``(state,)``.
     psi0
         Initial azimuth in rad.
+    field
+        Harmonics of the wind field for the outputs, at the ends of all steps or the samples of the
+        run, ``(time, channel)``.
     """
 
     drive: Drive
     x0: Array
     psi0: float
+    field: Array
 
 
 @dataclass(frozen=True)
@@ -179,6 +183,19 @@ def pieces_of(driven: Trajectory, interpolation: str) -> Pieces:
     return Pieces(time, coefficients, time[1:-1][(missed > least).any(axis=1)])
 
 
+def at_steps(field: Trajectory, mesh: Mesh, interpolation: str) -> Array:
+    """What drives outputs alone, at the ends of all steps, ``(step + 1, channel)``.
+
+    Interpolated as `mesh_of` does with the inputs.
+    """
+    if mesh.every == 1 or not field.channels:
+        return field.values
+    time = mesh.time[::2]
+    if interpolation == "cubic":
+        return CubicSpline(field.time, field.values)(time)
+    return _between(field.values, np.arange(mesh.every) / mesh.every)
+
+
 def _between(values: Array, parts: Array) -> Array:
     """Values at fractions of every interval between rows, and the last row."""
     steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
@@ -225,7 +242,10 @@ def _march_batch(model: DFSM, cases: Sequence[Case[Mesh]]) -> list[Rollout]:
         inputs[i, : len(m.time)] = m.inputs
         inputs[i, len(m.time) :] = m.inputs[-1]
     x0, psi0 = np.stack([c.x0 for c in cases]), np.array([c.psi0 for c in cases])
-    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, inputs))
+    field = np.zeros((len(cases), padded + 1, cases[0].field.shape[1]))
+    for i, c in enumerate(cases):
+        field[i, : len(c.field)] = c.field
+    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, (inputs, field)))
     rollouts = []
     for i, m in enumerate(c.drive for c in cases):
         rows = slice(0, m.steps + 1, m.every)
@@ -235,15 +255,15 @@ def _march_batch(model: DFSM, cases: Sequence[Case[Mesh]]) -> list[Rollout]:
 
 @eqx.filter_jit
 def _march(
-    model: DFSM, x0: Array, psi0: Array, h: Array, inputs: Array
+    model: DFSM, x0: Array, psi0: Array, h: Array, drive: tuple[Array, Array]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    model = model.prepared()
+    model, (inputs, field) = model.prepared(), map(jnp.asarray, drive)
 
     def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
         return rk4(model, x0, h, v)
 
-    xs = jax.vmap(states)(*map(jnp.asarray, (x0, h, inputs)))
-    seen = _observe(model, jnp.asarray(h), xs, jnp.asarray(inputs)[:, ::2], jnp.asarray(psi0))
+    xs = jax.vmap(states)(jnp.asarray(x0), jnp.asarray(h), inputs)
+    seen = _observe(model, jnp.asarray(h), xs, (inputs[:, ::2], field), jnp.asarray(psi0))
     return xs, *seen
 
 
@@ -294,19 +314,24 @@ def rate(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def _observe(
-    model: DFSM, h: jax.Array, xs: jax.Array, v: jax.Array, psi0: jax.Array
+    model: DFSM,
+    h: jax.Array,
+    xs: jax.Array,
+    drive: tuple[jax.Array, jax.Array],
+    psi0: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Outputs along rollouts ``(..., time, n)`` and whether any input is outside its range.
 
-    The azimuth is the integral of the rollout's own speed.
+    `drive` are the exogenous inputs and the wind field. The azimuth is the integral of the
+    rollout's own speed.
     """
     turn, psi = model.signals.azimuth_rate, None
     if turn is not None:
         omega = turn[1] * xs[..., turn[0]]
         angle = jnp.cumsum(0.5 * h * (omega[..., 1:] + omega[..., :-1]), axis=-1)
         psi = psi0[..., None] + jnp.concatenate([jnp.zeros_like(omega[..., :1]), angle], axis=-1)
-    groups = model.signals.order.split_exogenous(v)
-    return model.output(xs, *groups, psi), model.region.outside(model.join(xs, *groups))
+    groups = model.signals.order.split_exogenous(drive[0])
+    return model.output(xs, *groups, psi, drive[1]), model.region.outside(model.join(xs, *groups))
 
 
 # -- adaptive steps -----------------------------------------------------------------------------
@@ -334,8 +359,11 @@ def adapt(model: DFSM, case: Case[Pieces], method: str, tolerances: tuple[float,
     bends = np.full((len(drive.bends) // _PAD + 1) * _PAD, np.inf)
     bends[: len(drive.bends)] = drive.bends
     # Tolerances as arrays: a Python number would be compiled in, and another compile again.
-    arrays = (drive.time, drive.coefficients, bends, case.x0, case.psi0, *tolerances)
-    states, outputs, outside, solved = _adapt(model, *map(jnp.asarray, arrays), method=method)
+    start = (case.x0, case.psi0, case.field)
+    arrays = (drive.time, drive.coefficients, bends, *tolerances)
+    states, outputs, outside, solved = _adapt(
+        model, *map(jnp.asarray, arrays), start=tuple(map(jnp.asarray, start)), method=method
+    )
     return Rollout(np.asarray(states), np.asarray(outputs), np.asarray(outside), bool(solved))
 
 
@@ -345,15 +373,15 @@ def _adapt(
     samples: jax.Array,
     coefficients: jax.Array,
     bends: jax.Array,
-    x0: jax.Array,
-    psi0: jax.Array,
     rtol: jax.Array,
     atol: jax.Array,
     *,
+    start: tuple[jax.Array, ...],
     method: str,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     import diffrax
 
+    x0, psi0, field = start
     d, c, b, a = coefficients
     path = diffrax.CubicInterpolation(samples, (d, c, b, a))
     spread = model.region.std[model.signals.state_columns]
@@ -376,5 +404,5 @@ def _adapt(
     )
     states = jnp.asarray(solution.ys) * spread
     v = jnp.concatenate([a, path.evaluate(samples[-1])[None]])
-    outputs, outside = _observe(model, jnp.diff(samples), states, v, psi0)
+    outputs, outside = _observe(model, jnp.diff(samples), states, (v, field), psi0)
     return states, outputs, outside, solution.result == diffrax.RESULTS.successful

@@ -23,8 +23,18 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state
-from dfsm.models.signals import require_constant, with_computed
-from dfsm.simulation.integrate import Case, Drive, Rollout, adapt, march, mesh_of, pieces_of
+from dfsm.models.signals import require_constant, require_field, with_computed
+from dfsm.simulation.integrate import (
+    Case,
+    Drive,
+    Mesh,
+    Rollout,
+    adapt,
+    at_steps,
+    march,
+    mesh_of,
+    pieces_of,
+)
 
 # A rollout ends where a state is this many times its training half-range from the middle.
 _ESCAPE = 10.0
@@ -167,7 +177,8 @@ def simulate(
         The surrogate.
     runs
         Trajectories that hold the model's controls, disturbances and parameters, and its measured
-        states unless there is `initial`. Samples before `start` serve only for the initial rates.
+        states unless there is `initial`; those of a model with `Azimuth.rings` also the azimuth and
+        the harmonics of the wind field. Samples before `start` serve only for the initial rates.
     start, stop
         Time window in s; None leaves that end open.
     initial
@@ -202,25 +213,33 @@ def simulate(
     names = model.signals.exogenous
     for run in batch:
         run.columns((*names, *(model.signals.measured if initial is None else ())))
+        require_field(run, model.signals.azimuth)
+    fields = [
+        r.select(model.signals.names("field")).window(start, stop).require_finite() for r in batch
+    ]
     driven = [r.select(names).window(start, stop).require_finite() for r in batch]
     for run in driven:
         require_constant(run, model.signals.names("parameters"))
     starts = None if initial is None else _starts(model, initial, len(batch))
 
-    def case(i: int, drive: Drive) -> Case[Drive]:
+    def case(i: int, drive: Drive, field: Array) -> Case[Drive]:
         begins = float(driven[i].time[0])
         x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
-        return Case(drive, x0, _initial_azimuth(model, batch[i], begins))
+        return Case(drive, x0, _initial_azimuth(model, batch[i], begins), field)
+
+    def marched(i: int) -> Case[Mesh]:
+        mesh = mesh_of(driven[i], settings.step, between)
+        return case(i, mesh, at_steps(fields[i], mesh, between))
 
     begin = clock.perf_counter()
     each, between = range(len(batch)), settings.interpolation
     if settings.method == "rk4":
-        solved = march(model, (case(i, mesh_of(driven[i], settings.step, between)) for i in each))
+        solved = march(model, (marched(i) for i in each))
     else:
         tolerances = (settings.rtol, settings.atol)
-        cases = (case(i, pieces_of(driven[i], between)) for i in each)
+        cases = (case(i, pieces_of(driven[i], between), fields[i].values) for i in each)
         solved = (adapt(model, c, settings.method, tolerances) for c in cases)
     results = [
         _result(model, r, d, rollout) for r, d, rollout in zip(batch, driven, solved, strict=True)
