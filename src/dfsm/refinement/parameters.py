@@ -104,11 +104,18 @@ class Parametrization(eqx.Module):
 
     def at(self, deviations: jax.Array) -> DFSM:
         """The model at some deviations, shape ``(parameter,)``; JAX can follow it."""
+        f, e = self._functions(deviations)
+        return replace(self.model, f=f, e=e)
+
+    # One compilation instead of one for each little operation; not of the model, whose provenance
+    # would be that of the first.
+    @eqx.filter_jit
+    def _functions(self, deviations: jax.Array) -> tuple[LinearModel, Corrective | None]:
         scheduled, constant, dynamics, drive, *corrective = self._parts(deviations)
-        model = replace(
-            self.model, f=self._linear(scheduled, constant), e=self._corrective(corrective)
-        )
-        return self._latents(model, dynamics, drive) if self.model.signals.latents else model
+        f, e = self._linear(scheduled, constant), self._corrective(corrective)
+        if self.model.signals.latents:
+            f = self._latents(replace(self.model, f=f), dynamics, drive).f
+        return f, e
 
     def slopes(
         self, deviations: jax.Array, model: DFSM, inputs: jax.Array, weights: jax.Array
