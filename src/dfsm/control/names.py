@@ -19,6 +19,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.inputs import InputOrder
 from dfsm.models.region import Region
 from dfsm.simulators import ODESystem
+from dfsm.simulators.evaluate import Function, as_jax
 
 # Letter of a group in user functions, and what it holds.
 GROUPS = {
@@ -86,15 +87,20 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
             "give: write f with jax.numpy and set backend to jax"
         )
     channels = {g: tuple(getattr(model, g)) for g in GROUPS.values()}
-    g = model.g
+    return Plant(channels, _AsArray(model.f), _AsArray(model.g), None)
 
-    def derivative(x: Any, u: Any, w: Any, p: Any) -> Any:
-        return jnp.asarray(model.f(x, u, w, p), dtype=jnp.float64)
 
-    def output(x: Any, u: Any, w: Any, p: Any) -> Any:
-        return jnp.zeros(0) if g is None else jnp.asarray(g(x, u, w, p), dtype=jnp.float64)
+@dataclass(frozen=True)
+class _AsArray:
+    """What a function of a system returns, as an array; nothing without a function.
 
-    return Plant(channels, derivative, output, None)
+    Equal where the functions are, so that problems on one system share compilations.
+    """
+
+    function: Function | None
+
+    def __call__(self, x: Any, u: Any, w: Any, p: Any) -> Any:
+        return jnp.zeros(0) if self.function is None else as_jax(self.function(x, u, w, p))
 
 
 class Group:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +52,7 @@ class Poles(NamedTuple):
     offset: jax.Array
 
 
+@eqx.filter_jit
 def poles(model: DFSM) -> Poles:
     """Dynamics of a model's latent pairs."""
     driving, first, even, odd = _places(model)
@@ -65,6 +67,12 @@ def poles(model: DFSM) -> Poles:
 
 def with_poles(model: DFSM, dynamics: Poles) -> DFSM:
     """The model with other dynamics of its latent pairs; JAX can follow it."""
+    return replace(model, f=_with_poles(model, dynamics))
+
+
+# Not the model: compiled code would hand out the provenance of the first.
+@eqx.filter_jit
+def _with_poles(model: DFSM, dynamics: Poles) -> LinearModel:
     driving, first, even, odd = _places(model)
     L, b = model.f.coefficients, model.f.offsets
     for rows, others, sign, part in ((even, odd, 1.0, jnp.real), (odd, even, -1.0, jnp.imag)):
@@ -72,7 +80,7 @@ def with_poles(model: DFSM, dynamics: Poles) -> DFSM:
         L = L.at[:, rows, first + others].set(sign * dynamics.frequency)
         L = L.at[:, rows, driving].set(part(dynamics.drive))
         b = b.at[:, rows].set(part(dynamics.offset))
-    return replace(model, f=replace(model.f, coefficients=L, offsets=b))
+    return replace(model.f, coefficients=L, offsets=b)
 
 
 def _places(model: DFSM) -> tuple[slice, int, IntArray, IntArray]:
@@ -120,12 +128,14 @@ def evolve(dynamics: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.
     return jnp.concatenate([start[None], path])
 
 
+@jax.jit
 def as_states(pairs: jax.Array) -> jax.Array:
     """Real states ``(..., 2 pair)`` in a model's order from complex pairs ``(..., pair)``."""
     both = jnp.stack([pairs.real, pairs.imag], axis=-1)
     return both.reshape(*pairs.shape[:-1], -1)
 
 
+@eqx.filter_jit
 def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
     """Input vectors ``(..., input)`` with the latent states that their own inputs lead to."""
     s = model.signals
@@ -217,14 +227,14 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
     at, n = s.state_columns.stop, len(s.states)
 
     def wider(linear: LinearModel, extra_rows: int) -> LinearModel:
-        L = jnp.insert(linear.coefficients, np.full(count, at), 0.0, axis=2)
-        zero = jnp.zeros((len(L), extra_rows, L.shape[2]))
-        L = jnp.concatenate([L, zero], axis=1)
-        b = jnp.concatenate([linear.offsets, jnp.zeros((len(L), extra_rows))], axis=1)
-        return replace(linear, coefficients=L, offsets=b)
+        L = np.insert(np.asarray(linear.coefficients), np.full(count, at), 0.0, axis=2)
+        L = np.pad(L, ((0, 0), (0, extra_rows), (0, 0)))
+        b = np.pad(np.asarray(linear.offsets), ((0, 0), (0, extra_rows)))
+        if extra_rows:
+            L[:, :n, at : at + count] = coupling
+        return replace(linear, coefficients=jnp.asarray(L), offsets=jnp.asarray(b))
 
     f = wider(model.f, count)
-    f = replace(f, coefficients=f.coefficients.at[:, :n, at : at + count].set(coupling))
     names = tuple(Channel(f"latent{k + 1}", "-") for k in range(count))
     wide = DFSM(
         f=f,

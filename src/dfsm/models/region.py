@@ -13,6 +13,7 @@ import dfsm.core.jax_setup  # noqa: F401
 from dfsm.numerics.hats import hats
 
 
+@jax.jit
 def squared_distance(
     inputs: jax.Array, shares: jax.Array, middles: jax.Array, W: jax.Array
 ) -> jax.Array:
@@ -69,6 +70,10 @@ class Region(eqx.Module):
         Either an input is outside its range, or all together are farther from what occurred
         together than samples of a new run usually are.
         """
+        return self._outside(jnp.asarray(inputs))
+
+    @eqx.filter_jit
+    def _outside(self, inputs: jax.Array) -> jax.Array:
         # An optimum that is kept inside meets the limit to a solver's tolerance.
         return jnp.any(self.beyond(inputs), axis=-1) | (self.distance(inputs) > 1 + 1e-6)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import dfsm.core.jax_setup  # noqa: F401
 
 
+@jax.jit
 def hats(grid: jax.Array, value: jax.Array) -> jax.Array:
     """Weight of every point at schedule values ``(...)``, shape ``(..., point)``.
 

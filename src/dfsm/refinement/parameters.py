@@ -112,15 +112,21 @@ class Parametrization(eqx.Module):
 
     def at(self, deviations: jax.Array) -> DFSM:
         """The model at some deviations, shape ``(parameter,)``; JAX can follow it."""
+        f, e, terms = self._functions(deviations)
+        return replace(self.model, f=f, e=e, terms=terms)
+
+    # One compilation instead of one for each little operation; not of the model, whose provenance
+    # would be that of the first.
+    @eqx.filter_jit
+    def _functions(
+        self, deviations: jax.Array
+    ) -> tuple[LinearModel, Corrective | None, Terms | None]:
         scheduled, constant, dynamics, drive, *others = self._parts(deviations)
         terms, corrective = self._divided(others)
-        model = replace(
-            self.model,
-            f=self._linear(scheduled, constant),
-            e=self._corrective(corrective),
-            terms=self._terms(terms),
-        )
-        return self._latents(model, dynamics, drive) if self.model.signals.latents else model
+        f, e = self._linear(scheduled, constant), self._corrective(corrective)
+        if self.model.signals.latents:
+            f = self._latents(replace(self.model, f=f), dynamics, drive).f
+        return f, e, self._terms(terms)
 
     def slopes(
         self, deviations: jax.Array, model: DFSM, inputs: jax.Array, weights: jax.Array
