@@ -56,6 +56,9 @@ derivatives:
 linear:
 {linear}
 
+# Known physics inside the linear fit: rotor, quadratic_drag, product; docs/method.md has an example.
+terms: []
+
 corrective:
   kind: mlp           # or rbf, rbf_incremental, gp, none; docs/method.md lists their keys
   hidden: [20, 20]    # units per layer
