@@ -59,8 +59,8 @@ for name, value in COMPILED.items():
         # JAX has read its environment.
         jax.config.update(name.lower(), value)
 
-# As in `fit`: each worker has a processor, and threads of BLAS wait for one another many times longer
-# than they work.
+# As in `fit`: each worker has a processor, and threads of BLAS would wait for one another many
+# times longer than they work.
 threadpool_limits(limits=1)
 
 # Bytes that a process may take on before it drops what was compiled.
