@@ -21,6 +21,7 @@ import jax
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
+from threadpoolctl import threadpool_limits
 
 from dfsm import cli
 from dfsm.data.readers.tables import write_table
@@ -57,6 +58,10 @@ for name, value in COMPILED.items():
         os.environ[name] = str(value)
         # JAX has read its environment.
         jax.config.update(name.lower(), value)
+
+# As in `fit`: each worker has a processor, and threads of BLAS would wait for one another many
+# times longer than they work.
+threadpool_limits(limits=1)
 
 # Bytes that a process may take on before it drops what was compiled.
 MOST_COMPILED = 500_000_000

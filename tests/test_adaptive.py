@@ -31,6 +31,11 @@ PENDULUM = dfsm.ODESystem(
 )
 
 
+# One function, so that problems on one model share compilations.
+def effort(s):
+    return s.u.torque**2
+
+
 def problem(model, **changes):
     given = {
         "model": model,
@@ -38,7 +43,7 @@ def problem(model, **changes):
         "initial": {"angle": 0.0, "speed": 0.0},
         "final": {"angle": 1.8, "speed": 0.0},
         "bounds": {"torque": (-6.0, 6.0)},
-        "cost": lambda s: s.u.torque**2,
+        "cost": effort,
         "name": "swing up",
     }
     return dfsm.OptimalControlProblem(**(given | changes))

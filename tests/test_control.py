@@ -46,6 +46,16 @@ def test_the_controls_do_in_an_integrator_what_the_solution_says():
         assert text in found.summary()
 
 
+def test_problems_on_one_system_have_the_same_functions():
+    """Compilations are shared by what is equal."""
+    one, other = problem().plant, problem(horizon=(0.0, 4.0)).plant
+    assert one is not other
+    assert (one.derivative, one.output) == (other.derivative, other.output)
+    assert hash(one.derivative) == hash(other.derivative)
+    changed = replace(problem().model, f=lambda x, u, w, p: x)
+    assert problem(model=changed).plant.derivative != one.derivative
+
+
 def test_a_coarse_mesh_deviates_in_an_integrator():
     found = solved(problem(), DirectTranscription(scheme="trapezoidal", mesh=5, refine=None))
     again = solved(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ def wave(seed: int) -> np.ndarray:
     return np.sin(2 * np.pi * f * TIME[:, None] + phase).sum(1)
 
 
+@cache
 def driven(seed: int) -> Trajectory:
     """x' = -0.5 x + w' + 2 lag(w): what w alone, at one time, cannot tell."""
     w = wave(seed)

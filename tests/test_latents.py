@@ -23,8 +23,9 @@ from dfsm.fitting.fit import fit
 from dfsm.fitting.linear import LPV, LTI, fit_linear
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.corrective import GaussianUnits, Perceptron
-from dfsm.models.latents import Poles, as_states, evolve, latent_path, poles
+from dfsm.models.latents import Poles, as_states, evolve, latent_path, poles, with_poles
 from dfsm.models.model_folder import load, load_all, save
+from dfsm.models.signals import Provenance
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings, refine
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
@@ -158,6 +159,12 @@ def test_their_rows_are_stable_and_know_no_schedule(model):
     for _, values in model.eigenvalues():
         assert len(values) == 3
         assert values.real.max() < 0
+
+
+def test_a_model_with_other_dynamics_has_its_own_history(model):
+    for told in ("one", "other"):
+        marked = replace(model, provenance=Provenance({"told": told}))
+        assert with_poles(marked, poles(marked)).provenance.record == {"told": told}
 
 
 def test_everything_else_takes_them(model, tmp_path, runs):

@@ -24,6 +24,7 @@ from dfsm.fitting.linear import LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.corrective import GaussianUnits, Perceptron
 from dfsm.models.model_folder import load
+from dfsm.models.signals import Provenance
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Stop
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
@@ -374,6 +375,15 @@ def test_deviations_change_what_they_should(kind):
     assert (np.abs(np.asarray(slopes)).max(axis=0) > 0).all()
     # Only the last row is corrected, and its spread is the unit of change.
     assert (np.asarray(slopes)[0, 8:] == 0).all()
+
+
+def test_what_is_made_of_a_model_has_its_history(biased):
+    """Not that of another model of the same size, for which it was compiled."""
+    zero = np.zeros(4)
+    for told in ("one", "other"):
+        model = replace(biased, provenance=Provenance({"told": told}))
+        changed = Parametrization.of(model, np.ones(2)).at(jnp.asarray(zero))
+        assert changed.provenance.record == {"told": told}
 
 
 @pytest.mark.parametrize(

@@ -118,12 +118,18 @@ def lagged(time: np.ndarray, u: np.ndarray, interpolation: str) -> np.ndarray:
         pieces = CubicSpline(time, u)
     else:
         pieces = PPoly(np.stack([np.diff(u) / np.diff(time), u[:-1]]), time)
-    # A particular solution is u - u̇ + ü - ...; the rest decays.
+
+    def particular(t: np.ndarray) -> np.ndarray:
+        """u - u̇ + ü - ... at times since the sample before, one in each piece."""
+        return sum((-1) ** k * np.polyval(pieces.derivative(k).c, t) for k in range(4))
+
+    steps = np.diff(time)
     x = [0.0]
-    for i, (a, b) in enumerate(pairwise(time)):
-        p = np.poly1d(pieces.c[:, i])
-        particular = p - p.deriv() + p.deriv(2) - p.deriv(3)
-        x.append(particular(b - a) + (x[-1] - particular(0)) * np.exp(a - b))
+    # What is not of the particular solution decays.
+    for begin, end, left in zip(
+        particular(0 * steps), particular(steps), np.exp(-steps), strict=True
+    ):
+        x.append(end + (x[-1] - begin) * left)
     return np.array(x)
 
 
