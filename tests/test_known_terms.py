@@ -104,6 +104,10 @@ def test_terms_are_saved_and_loaded(dragged, bodies, tmp_path):
     np.testing.assert_array_equal(*both)
 
 
+def test_a_summary_names_terms(dragged):
+    assert "terms: drag(q_dot)" in dragged.summary()
+
+
 def test_a_users_function_is_passed_again(bodies, tmp_path):
     def cubic(x: jax.Array) -> jax.Array:
         return x**3

@@ -349,12 +349,16 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
 def test_the_bundled_runs_are_complete_and_small():
     files = [p for p in EXAMPLES.iterdir() if p.is_file()]
-    assert sum(p.stat().st_size for p in files) <= 12_000_000
+    winds = list((EXAMPLES / "winds").iterdir())
+    assert sum(p.stat().st_size for p in (*files, *winds)) <= 14_500_000
     stems = {p.stem for p in files if p.suffix in (".outb", ".parquet")}
-    assert len(stems) == 38
+    assert len(stems) == 44
+    # Every run has the wind of its seed; perturbed runs have that of their namesake.
+    assert {p.stem for p in winds} == {f"iea15_{'_'.join(s.split('_')[2:4])}" for s in stems}
     assert sum(p.suffix == ".outb" for p in files) == 3
     wall_times = json.loads((EXAMPLES / "wall_times.json").read_text())
-    assert set(wall_times) == stems
+    timed = {s for s in stems if s.split("_")[2] in ("06mps", "12mps", "18mps")}
+    assert set(wall_times) == timed
     run = read(EXAMPLES / "iea15_2dof_12mps_s02_ol.parquet")
     assert run.name == "iea15_2dof_12mps_s02_ol"
     assert run.wall_time == wall_times[run.name]

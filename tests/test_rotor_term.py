@@ -299,12 +299,13 @@ def test_samples_beyond_the_table_are_told(moving, plain):
 
 def test_acceleration_per_torque():
     inertia = 3.2e8
-    term = term_of(rotor(inertia=inertia))
+    term = term_of(rotor(inertia=inertia, generator_torque="Torque"))
     # J ω' = T, in rpm/s per kN m.
     expected = 1e3 / inertia * 30 / np.pi
     assert term.acceleration_per_rotor_torque == pytest.approx(expected, rel=1e-12)
     assert term.acceleration_per_generator_torque == pytest.approx(-expected, rel=1e-12)
-    geared = term_of(rotor(inertia=inertia, speed="Generator", gearbox_ratio=50.0, efficiency=0.95))
+    drive = {"speed": "Generator", "gearbox_ratio": 50.0, "efficiency": 0.95}
+    geared = term_of(rotor(inertia=inertia, generator_torque="Torque", **drive))
     shaft = 1e3 / inertia * 50 * 180 / np.pi
     assert geared.acceleration_per_rotor_torque == pytest.approx(shaft, rel=1e-12)
     generator = -shaft * 50 / 0.95
@@ -390,6 +391,8 @@ def test_coarse_tables_are_told(plain, records):
         ({"hub_height": -1.0, "pitch_rate": "PitchRate"}, "rotor.hub_height is -1.0"),
         ({"gearbox_ratio": 0.0}, "rotor.gearbox_ratio is 0.0"),
         ({"inertia": -5.0}, "rotor.inertia is -5.0"),
+        ({"inertia": 3e8}, "without rotor.generator_torque"),
+        ({"generator_torque": "Torque"}, "without rotor.inertia"),
         ({"efficiency": 1.2}, "rotor.efficiency is 1.2"),
         ({"efficiency": 0.0}, "rotor.efficiency is 0.0"),
         ({"density": 12.25}, "rotor.density is 12.25, expected kg/m³ of air (0.8 to 1.6) or water"),

@@ -147,7 +147,7 @@ def double(x: jax.Array) -> jax.Array:
 
 
 SETTINGS = (
-    rotor(corrections=("Inner",), hub_height=150.0, pitch_rate="PitchRate", inertia=3e8),
+    rotor(corrections=("Inner",), hub_height=150.0, pitch_rate="PitchRate"),
     QuadraticDrag(velocity="Surge"),
     Product(factors=("Wind", "Speed")),
     Function(name="twice", function=double, inputs=("Wind",)),

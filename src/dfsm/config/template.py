@@ -56,7 +56,7 @@ derivatives:
 linear:
 {linear}
 
-# Known physics inside the linear fit: rotor, quadratic_drag, product; docs/method.md has an example.
+# Known physics in the linear fit: rotor, quadratic_drag, product; docs/method.md has an example.
 terms: []
 
 corrective:

@@ -314,6 +314,8 @@ class DFSM(eqx.Module):
             lines.append(
                 f"wind field, for outputs: {len(s.field)} harmonics over rings of {rings} m"
             )
+        if self.terms is not None:
+            lines.append(f"terms: {', '.join(c.label for c in self.terms.channels)}")
         kind = f"LPV in {self.schedule}, {len(self.f.grid)} points" if self.schedule else "LTI"
         lines.append(f"linear fit: {kind}, condition number {record.get('condition', np.nan):.3g}")
         for row in record.get("rows", []):
