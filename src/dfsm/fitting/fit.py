@@ -196,7 +196,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     columns = samples.signals.state_columns
     if settings.linear.margin is not None:
         before = result.residual_rms
-        slopes = None if samples.terms is None else _slopes(samples, result)
+        slopes = _slopes(samples, result)
         result, moved = stabilise(
             result, columns, kinematic, settings.linear.margin, settings.linear.affine, slopes
         )
@@ -253,7 +253,7 @@ def _slopes(samples: Samples, fit: LinearFit) -> Array:
     terms, n = samples.terms, samples.inputs.shape[1]
     if terms is None:
         return np.zeros((len(fit.equations), 0, len(samples.signals.states)))
-    middles = np.stack([e.mean[:n] for e in fit.equations])
+    middles = np.stack([e.moments(centred=True)[0][:n] for e in fit.equations])
     return terms.slopes(middles)[:, :, samples.signals.state_columns]
 
 

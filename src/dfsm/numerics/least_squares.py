@@ -72,11 +72,6 @@ class NormalEquations:
         return np.zeros_like(self.shift), self.products / self.count
 
     @property
-    def mean(self) -> Array:
-        """Mean of every input and target."""
-        return self.shift + self.sums / self.count
-
-    @property
     def std(self) -> Array:
         """Standard deviation of every input and target."""
         offset = self.sums / self.count
