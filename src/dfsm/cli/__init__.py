@@ -242,8 +242,8 @@ def simulate(
     from dfsm.core.files import check_file
     from dfsm.data.readers import read
     from dfsm.data.readers.tables import table_suffix, write_table
+    from dfsm.models.completion import completed
     from dfsm.models.model_folder import load
-    from dfsm.models.signals import with_computed
     from dfsm.simulation.simulate import METHODS, SimulationSettings
     from dfsm.simulation.simulate import simulate as run_simulate
     from dfsm.validation.intervals import load_intervals
@@ -257,9 +257,9 @@ def simulate(
     calibrated = None if intervals is None else load_intervals(intervals)
     if calibrated is not None:
         calibrated.check(surrogate)
+    with working(quiet):
+        recorded = completed(read(run), surrogate.signals)
     with working(quiet), hushed():  # the outcome is printed below
-        signals = surrogate.signals
-        recorded = with_computed(read(run), signals.hub_height, signals.features)
         result = run_simulate(
             surrogate,
             recorded,

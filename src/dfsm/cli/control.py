@@ -51,6 +51,10 @@ def check_run(
     result: Result,
     run: Annotated[str, typer.Argument(help="High-fidelity run under the optimal controls.")],
     scenario: Scenario = 1,
+    ratio: Annotated[
+        float | None,
+        typer.Option(help="Speed of the torque's shaft over that of the speed, for the power."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a high-fidelity run under optimal controls with what was predicted."""
@@ -59,7 +63,7 @@ def check_run(
     from dfsm.control import load_solution
     from dfsm.data.readers import read
 
-    comparison = compare(load_solution(result), read(run), scenario)
+    comparison = compare(load_solution(result), read(run), scenario, ratio)
     if as_json:
         print_json(comparison.to_dict())
     else:

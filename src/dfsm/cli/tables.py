@@ -169,8 +169,10 @@ def print_check(check: RunCheck) -> None:
     span = f"{check.start:g} to {check.stop:g} s, {part}"
     console.print(_text(f"{check.run} against {check.name}, {span}; figures: predicted → actual"))
     if check.power is not None:
-        ahead, came = check.power["predicted"], check.power["actual"]
-        console.print(_text(f"mean power ({check.power_source}): {ahead:.5g} → {came:.5g} kW"))
+        ahead, came = (_figure(check.power[k], ".5g") for k in ("predicted", "actual"))
+        console.print(_text(f"mean power ({check.power_source}): {ahead} → {came} kW"))
+    if check.power_advice:
+        console.print(_text(check.power_advice))
     table = _table("channel", "unit", "mean", "max", "DEL m=4", "DEL m=10", "RMSE", "NRMSE")
     for name, c in check.channels.items():
         a, b = c.predicted, c.actual

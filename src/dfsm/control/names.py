@@ -13,7 +13,9 @@ from typing import Any
 import jax.numpy as jnp
 
 import dfsm.core.jax_setup  # noqa: F401
-from dfsm.data.trajectory import Channel
+from dfsm.data.conversion import in_units_of
+from dfsm.data.derivatives import per_second
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.dfsm import DFSM
 from dfsm.models.inputs import InputOrder
@@ -53,6 +55,29 @@ class Plant:
     def names(self, group: str) -> tuple[str, ...]:
         """Names of one group, e.g. ``names("states")``."""
         return tuple(c.name for c in self.channels[group])
+
+    def in_its_units(self, limits: Mapping[str, Any], kind: str) -> dict[str, Any]:
+        """Pairs of limits by channel, with those that a run holds in this plant's units.
+
+        Parameters
+        ----------
+        limits
+            By name; what is no run passes as it is.
+        kind
+            ``"bounds"``, or ``"rates"``, which are per second.
+        """
+        units = {c.name: c.unit for group in self.channels.values() for c in group}
+
+        def taken(name: str, limit: Any) -> Any:
+            if not isinstance(limit, Trajectory):
+                return limit
+            unit = per_second(units[name]) if kind == "rates" else units[name]
+            return in_units_of(limit, [Channel(name, unit)])
+
+        return {
+            name: tuple(taken(name, limit) for limit in pair) if isinstance(pair, tuple) else pair
+            for name, pair in limits.items()
+        }
 
     @property
     def order(self) -> InputOrder:

@@ -17,6 +17,7 @@ import numpy as np
 
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
+from dfsm.core.units import agree
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.filters import Filter, filtered
@@ -317,7 +318,7 @@ def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None
     wanted = unit
     for _ in range(times):
         wanted = per_second(wanted)
-    if unit and its and _time_power(its) != _time_power(wanted):
+    if not agree(its, wanted):
         raise DfsmError(
             f"{run.where}: channel '{name}' in '{its}' is not the "
             f"{('first', 'second')[times - 1]} derivative of '{spec.name}' in '{unit}': a channel "

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
-from dfsm.core.units import plain
+from dfsm.core.units import agree
 from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -116,7 +116,7 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
 
 
 def _require_one_unit(run: Trajectory, source: Channel, other: Channel) -> None:
-    if plain(source.unit) != plain(other.unit):
+    if not agree(source.unit, other.unit):
         raise DfsmError(
             f"{run.where}: a feature takes '{other.name}' ({other.unit}) off '{source.name}' "
             f"({source.unit}): name two channels in one unit"

@@ -6,6 +6,7 @@ at work, so that a horizon which begins at 100 s leaves 100 s for the turbine to
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,43 @@ from dfsm.control.solution import Solution
 from dfsm.core.files import write_file
 from dfsm.core.settings import require
 from dfsm.core.types import Array
-from dfsm.core.units import ANGLES, TORQUES, plain
+from dfsm.core.units import factor
+from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, near_matches, printable
 
 # More rows than this are a mistyped step.
 _MOST_ROWS = 1_000_000
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What a control may be to ROSCO: the names and the unit by which it is known."""
+
+    what: str
+    counterpart: str
+    names: re.Pattern[str]
+    examples: str
+    unit: str
+    expected: str
+
+
+_PITCH = _Kind(
+    what="pitch",
+    counterpart="torque",
+    names=re.compile(r"Bl(d|ade)?_?Pitch(C|Com|Cmd)?_?\d?|PtchPMz[bc]\d", re.IGNORECASE),
+    examples="BldPitch1, BlPitchC1, PtchPMzc1",
+    unit="rad",
+    expected="an angle (rad or deg)",
+)
+_TORQUE = _Kind(
+    what="torque",
+    counterpart="pitch",
+    names=re.compile(r"Gen(erator)?_?(Tq|Trq|Torq|Torque)(C|Com|Cmd)?", re.IGNORECASE),
+    examples="GenTq",
+    unit="N m",
+    expected="a torque (N m, kN m or MN m)",
+)
 
 
 @dataclass(frozen=True)
@@ -73,8 +105,9 @@ def write_rosco(
     path
         File to write: time in s, collective pitch in rad, generator torque in N m.
     pitch, torque
-        Controls to take; None takes the only one whose unit is an angle (rad, deg), and the only
-        one whose unit is a torque (N m, kN m, MN m).
+        Controls to take, in a unit of an angle or of a torque; None takes the one whose name says
+        what it is (BldPitch1, BlPitchC1, PtchPMzc1; GenTq). With one of the two given and no such
+        name for the other, that one is left out.
     scenario
         Which one, counted from 1.
     step
@@ -88,15 +121,15 @@ def write_rosco(
     Raises
     ------
     DfsmError
-        The solve did not succeed, no control is a pitch or a torque, units that are unknown, or a
-        file that cannot be written.
+        The solve did not succeed, no control is a pitch or a torque, a name that does not tell
+        which, units of something else, or a file that cannot be written.
     """
     if not solution.solved:
         raise DfsmError(f"{printable(solution.name)} was not solved: {solution.message}")
     run = _controls(solution, scenario, step)
     chosen = {
-        "pitch": _chosen(run, "pitch", "an angle (rad or deg)", pitch, ANGLES),
-        "torque": _chosen(run, "torque", "a torque (N m, kN m or MN m)", torque, TORQUES),
+        "pitch": _chosen(run, _PITCH, pitch, torque),
+        "torque": _chosen(run, _TORQUE, torque, pitch),
     }
     if chosen["pitch"] is None and chosen["torque"] is None:
         told = ", ".join(f"{c.name} in '{c.unit}'" for c in run.channels) or "none"
@@ -107,13 +140,14 @@ def write_rosco(
     columns, heads, number = [run.time], ["Time (s)"], dict.fromkeys(chosen, 0)
     for what, control in chosen.items():
         if control is not None:
-            channel, factor = control
-            columns.append(factor * run[channel.name])
-            heads.append(f"{channel.name} ({'rad' if what == 'pitch' else 'N m'})")
+            unit = "rad" if what == "pitch" else "N m"
+            taken = in_units_of(run, [Channel(control.name, unit)], "ROSCO")
+            columns.append(taken[control.name])
+            heads.append(f"{control.name} ({unit})")
             number[what] = len(columns)
     path = Path(path)
     _write(path, solution.name, heads, np.column_stack(columns))
-    names = {what: None if control is None else control[0].name for what, control in chosen.items()}
+    names = {what: None if control is None else control.name for what, control in chosen.items()}
     discon = {
         "OL_Mode": "1",
         "OL_Filename": f'"{path.name}"',
@@ -140,24 +174,35 @@ def _controls(solution: Solution, scenario: int, step: float | None) -> Trajecto
     return Trajectory(run.time[0] + since, values, controls.channels, name=run.name)
 
 
-def _chosen(
-    run: Trajectory, what: str, expected: str, name: str | None, units: Mapping[str, float]
-) -> tuple[Channel, float] | None:
-    """The control that is the pitch or the torque, and its unit in rad or N m."""
+def _chosen(run: Trajectory, kind: _Kind, name: str | None, other: str | None) -> Channel | None:
+    """The control that is the pitch or the torque.
+
+    A unit tells what a control is not, and never what it is: yaw is an angle, too.
+    """
     if name is not None:
         if name not in run:
-            raise DfsmError(f"{what}: no control '{name}'; {near_matches(name, run.names)}")
-        known = [run.channel(name)]
-        if plain(known[0].unit) not in units:
-            raise DfsmError(f"{what}: '{name}' is in '{known[0].unit}', expected {expected}")
-    else:
-        known = [c for c in run.channels if plain(c.unit) in units]
-    if len(known) > 1:
+            raise DfsmError(f"{kind.what}: no control '{name}'; {near_matches(name, run.names)}")
+        if factor(run.channel(name).unit, kind.unit) is None:
+            raise DfsmError(
+                f"{kind.what}: '{name}' is in '{run.channel(name).unit}', expected {kind.expected}"
+            )
+        return run.channel(name)
+    possible = [c for c in run.channels if factor(c.unit, kind.unit) is not None]
+    known = [c for c in possible if kind.names.fullmatch(c.name)]
+    if len(known) == 1 or not possible or (other is not None and not known):
+        return known[0] if known else None
+    named = " or ".join(c.name for c in known or possible)
+    if known:
         raise DfsmError(
-            f"the {what} may be {' or '.join(c.name for c in known)}, all in units of {expected}: "
-            f"name one with --{what}, or {what}= in Python"
+            f"the {kind.what} may be {named}, all in units of {kind.expected}: name one with "
+            f"--{kind.what}, or {kind.what}= in Python"
         )
-    return (known[0], units[plain(known[0].unit)]) if known else None
+    raise DfsmError(
+        f"{named} in '{possible[0].unit}' has no name by which ROSCO's {kind.what} is known "
+        f"({kind.examples}), and {kind.expected} may be something else: name the control with "
+        f"--{kind.what} ({kind.what}= in Python), or only the {kind.counterpart} with "
+        f"--{kind.counterpart}"
+    )
 
 
 def _write(path: Path, name: str, heads: list[str], values: Array) -> None:

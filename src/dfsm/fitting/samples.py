@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
+from dfsm.data.conversion import in_units_of
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
     differentiate,
@@ -115,8 +116,11 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     if twice:
         raise DfsmError(f"'{twice[0]}' is a state, which models simulate: leave it out of outputs")
     names = dict.fromkeys(roles)
+    runs = list(runs)
     if settings.azimuth is not None and settings.azimuth.angle is not None:
         names[settings.azimuth.angle] = None
+        angle = [Channel(settings.azimuth.angle, "deg")]
+        runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
@@ -207,8 +211,9 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
 
 
 def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
-    # The first run stands for all: `select` has made sure that units agree.
+    # `select` has made sure that units agree; a run may leave out what others state.
     first, names = data[0], state_names(settings.states)
+    first = replace(first, channels=tuple(data.channel(n) for n in first.names))
 
     def channels(names: Iterable[str], role: Role) -> tuple[Channel, ...]:
         return tuple(Channel(n, first.channel(n).unit, role=role) for n in names)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.settings import require, settings_class
-from dfsm.core.units import SPEEDS
+from dfsm.core.units import factor
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature, with_features
 from dfsm.data.trajectory import Channel, Trajectory
@@ -287,12 +287,12 @@ def radians_per_second(speed: Channel) -> float:
     DfsmError
         The unit is not one of a rotational speed.
     """
-    if speed.unit not in SPEEDS:
+    radians = factor(speed.unit, "rad/s")
+    if radians is None:
         raise DfsmError(
-            f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of "
-            f"{', '.join(SPEEDS)}"
+            f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of rpm, rad/s, deg/s"
         )
-    return SPEEDS[speed.unit]
+    return radians
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,9 @@ import numpy as np
 from dfsm.core.types import Array, IntArray
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
+from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, as_states, evolve, poles, rest
-from dfsm.models.signals import with_computed
 from dfsm.numerics.filters import moving_average
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
@@ -104,7 +104,7 @@ def record_of(
         Time window in s of the states.
     """
     s = model.signals
-    run = with_computed(run, s.hub_height, s.features)
+    run = completed(run, s)
     extracted = differentiate(run, s.specs, s.derivatives)
     window = run.window(start, stop)
     count = int(window.duration / step * (1 + 1e-9))

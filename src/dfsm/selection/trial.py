@@ -14,6 +14,7 @@ import numpy as np
 from dfsm.core.files import json_value
 from dfsm.core.types import Array
 from dfsm.core.version import __version__
+from dfsm.data.conversion import in_units_of
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
@@ -83,8 +84,9 @@ class Course:
 
         Candidates with filters of their own would else each be judged by another record.
         """
-        references = tuple(_reference(run, settings) for run in validation)
-        return cls(tuple(training), tuple(validation), references)
+        judged = [in_units_of(r, training[0].channels, "the training runs") for r in validation]
+        references = tuple(_reference(run, settings) for run in judged)
+        return cls(tuple(training), tuple(judged), references)
 
     @property
     def reference_digest(self) -> str:

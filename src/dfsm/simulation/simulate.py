@@ -21,9 +21,10 @@ from dfsm.core.types import Array
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
+from dfsm.models.completion import all_completed, completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state
-from dfsm.models.signals import require_constant, require_field, with_computed
+from dfsm.models.signals import require_constant, require_field
 from dfsm.simulation.integrate import (
     Case,
     Drive,
@@ -196,18 +197,19 @@ def simulate(
     Raises
     ------
     DfsmError
-        A channel is missing or not finite, a parameter varies within a run, the window is too
-        short, or the step too small for it.
+        A channel is missing, not finite or of another dimension than the model's, a parameter
+        varies within a run, the window is too short, or the step too small for it.
 
     Warns
     -----
     DfsmWarning
-        A rollout was outside the training range for part of the time, or ended early.
+        Channels were converted to the model's units, a rollout was outside the training range for
+        part of the time, or ended early.
     """
     settings = settings or SimulationSettings()
     single = isinstance(runs, Trajectory)
     batch = [runs] if isinstance(runs, Trajectory) else list(runs)
-    batch = [with_computed(r, model.signals.hub_height, model.signals.features) for r in batch]
+    batch = all_completed(batch, model.signals)
     if not batch:
         raise DfsmError("no runs were given to simulate")
     names = model.signals.exogenous
@@ -267,6 +269,7 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     ndarray
         Shape ``(state,)``.
     """
+    run = completed(run, model.signals)
     latent = latent_state(model, run, start)
     return np.concatenate([_observed_state(model, run, start), latent])
 

@@ -13,12 +13,14 @@ import numpy as np
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
+from dfsm.data.conversion import converted
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
+from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_path
-from dfsm.models.signals import Azimuth, radians_per_second, with_computed
+from dfsm.models.signals import Azimuth, radians_per_second
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
 from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
@@ -87,12 +89,14 @@ def validate(
                 f"{', '.join(models)}: give it that name, or leave the intervals out"
             )
         intervals.check(models[MULTI_FIDELITY])
-    runs = [with_computed(r, first.signals.hub_height, first.signals.features) for r in runs]
+    given = list(runs)
+    with hushed():  # the result tells
+        runs = all_completed(given, first.signals)
     if not runs:
         raise DfsmError("no test runs were given, at least one is needed")
     for run in runs:
         run.columns(first.signals.recorded)
-    notes = _leaks(first, runs, intervals)
+    notes = [*converted(given, runs), *_leaks(first, runs, intervals)]
     results = []
     for run in track(runs, "test runs"):
         results.append(_compare(models, run, (start, stop), settings, intervals))
