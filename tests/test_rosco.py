@@ -19,7 +19,7 @@ from dfsm.control import (
 )
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.exports.rosco import write_rosco
 from dfsm.numerics.fatigue import damage_equivalent_load
 from dfsm.simulators import ODESystem
@@ -130,11 +130,11 @@ def test_torque_alone_and_rows_between_the_nodes(solution, tmp_path):
 
 def test_controls_that_are_none_or_too_many_earn_a_sentence(solution, tmp_path):
     path = tmp_path / "ol.dat"
-    nothing = with_units(solution, GenTq="mN-m", BldPitch1="%")
-    with pytest.raises(DfsmError, match="its controls are GenTq in 'mN-m', BldPitch1 in '%'"):
+    nothing = with_units(solution, GenTq="kN", BldPitch1="%")
+    with pytest.raises(DfsmError, match="its controls are GenTq in 'kN', BldPitch1 in '%'"):
         write_rosco(nothing, path)
-    both = with_units(solution, BldPitch1="kN m")
-    with pytest.raises(DfsmError, match="the torque may be GenTq or BldPitch1"):
+    both = with_names(with_units(solution, BldPitch1="kN m"), BldPitch1="GenTorque")
+    with pytest.raises(DfsmError, match="the torque may be GenTq or GenTorque"):
         write_rosco(both, path)
     assert write_rosco(both, path, torque="GenTq").torque == "GenTq"
     with pytest.raises(DfsmError, match="pitch: 'GenTq' is in 'kN-m', expected an angle"):
@@ -145,6 +145,24 @@ def test_controls_that_are_none_or_too_many_earn_a_sentence(solution, tmp_path):
         write_rosco(solution, path, scenario=2)
     with pytest.raises(DfsmError, match="step is -1"):
         write_rosco(solution, path, step=-1)
+
+
+def test_a_unit_alone_makes_no_control_the_pitch_or_the_torque(solution, tmp_path):
+    path = tmp_path / "ol.dat"
+    yaws = with_names(solution, BldPitch1="NacYaw")
+    with pytest.raises(DfsmError, match=r"NacYaw in 'deg' has no name .* with --pitch"):
+        write_rosco(yaws, path)
+    assert not path.exists()
+    assert write_rosco(yaws, path, pitch="NacYaw").pitch == "NacYaw"
+    alone = write_rosco(yaws, path, torque="GenTq")
+    assert (alone.pitch, alone.discon["Ind_BldPitch"]) == (None, "0 0 0")
+    slow = with_names(solution, GenTq="RotTorq", BldPitch1="PtchPMzc1")
+    with pytest.raises(DfsmError, match=r"RotTorq in 'kN-m' has no name .* with --torque"):
+        write_rosco(slow, path)
+    assert write_rosco(slow, path, pitch="PtchPMzc1").torque is None
+    # A yaw beside what is known by its name is no reason to ask.
+    beside = with_names(with_units(solution, GenTq="deg"), GenTq="NacYaw")
+    assert write_rosco(beside, path).pitch == "BldPitch1"
 
 
 def test_the_command_prints_what_to_set(result, tmp_path, dfsm):
@@ -208,9 +226,45 @@ def test_runs_that_do_not_fit_earn_a_sentence(solution, run):
     other = tuple(replace(c, name="x" + c.name) for c in run.channels)
     with pytest.raises(DfsmError, match="no channels 'GenSpeed'"):
         check_run(solution, replace(run, channels=other))
-    other = tuple(replace(c, unit="rad/s" if c.unit == "rpm" else c.unit) for c in run.channels)
-    with pytest.raises(DfsmError, match="'GenSpeed' is in 'rad/s', in the solution in 'rpm'"):
+    other = tuple(replace(c, unit="m/s" if c.unit == "rpm" else c.unit) for c in run.channels)
+    with pytest.raises(DfsmError, match="'GenSpeed' is in 'm/s', in the solution in 'rpm'"):
         check_run(solution, replace(run, channels=other))
+
+
+def test_a_run_in_other_units_is_converted(solution, run):
+    size = {"GenSpeed": ("rad/s", np.pi / 30), "GenTq": ("N·m", 1e3), "BldPitch1": ("degrees", 1)}
+    units, sizes = zip(*(size.get(c.name, (c.unit, 1)) for c in run.channels), strict=True)
+    channels = tuple(replace(c, unit=u) for c, u in zip(run.channels, units, strict=True))
+    with pytest.warns(DfsmWarning, match="'GenSpeed' from rad/s to rpm, 'GenTq' from N·m to kN-m"):
+        found = check_run(solution, replace(run, values=run.values * sizes, channels=channels))
+    as_it_was = check_run(solution, run)
+    assert found.channels["GenTq"].rmse == pytest.approx(as_it_was.channels["GenTq"].rmse)
+    assert found.power["actual"] == pytest.approx(as_it_was.power["actual"])
+
+
+def test_power_is_that_of_one_shaft_or_the_runs_own(solution, run):
+    geared = with_names(solution, GenSpeed="RotSpeed")
+    turned = replace(
+        run,
+        channels=tuple(
+            replace(c, name="RotSpeed" if c.name == "GenSpeed" else c.name) for c in run.channels
+        ),
+    )
+    product = np.trapezoid(run["GenTq"] * run["GenSpeed"] * np.pi / 30, run.time) / 30
+    found = check_run(geared, turned)
+    assert found.power is None
+    assert "gearbox ratio between them with --ratio" in found.power_advice
+    assert check_run(geared, turned, ratio=97).power["actual"] == pytest.approx(97 * product)
+    with pytest.raises(DfsmError, match="ratio is -1, expected a number above 0"):
+        check_run(geared, turned, ratio=-1)
+    made = turned.with_channels([Channel("GenPwr", "MW")], np.full(len(run), 2.5))
+    made = made.with_channels([Channel("RotPwr", "kW")], np.full(len(run), 9.0))
+    found = check_run(geared, made)
+    assert found.power == {"predicted": None, "actual": pytest.approx(2500)}
+    assert found.power_source == "GenPwr"
+    found = check_run(solution, run.with_channels([Channel("Power", "kW")], np.full(len(run), 9.0)))
+    assert found.power["actual"] == pytest.approx(9)
+    assert found.power_source == "GenTq × GenSpeed → Power"
 
 
 def test_limits_survive_saving(solution, result, run):
@@ -228,6 +282,14 @@ def test_the_command_prints_tables_and_json(result, run, tmp_path, dfsm):
     found = json.loads(shown.out)
     assert found["limits"]["GenSpeed"]["actual"] > 0.05
     assert "no.parquet" in dfsm("check-run", result, "no.parquet").sentence
+
+
+def with_names(solution, **names):
+    def changed(run):
+        channels = [replace(c, name=names.get(c.name, c.name)) for c in run.channels]
+        return replace(run, channels=tuple(channels))
+
+    return replace(solution, trajectories=tuple(map(changed, solution.trajectories)))
 
 
 def with_units(solution, **units):

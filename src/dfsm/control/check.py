@@ -297,7 +297,7 @@ def _power(
     factors, advice = _factors(predicted, ratio)
     named = _power_channel(actual, next(iter(factors)) if len(factors) == 1 else "")
     came = named or (factors if all(name in actual for name in factors) else {})
-    if not factors and not came:
+    if not came:
         return None, "", advice
 
     def mean(run: Trajectory, factors: Mapping[str, float]) -> float | None:
