@@ -88,7 +88,8 @@ def print_validations(validations: Mapping[str, Validation]) -> None:
     )
     console.print(table)
     console.print(
-        "* of the multi-fidelity model, in the channel's unit; – no mean, a rollout ended early"
+        "* of the multi-fidelity model, in the channel's unit; – no mean, a rollout ended early or "
+        "the channel moves in no run"
     )
     if inside:
         console.print("inside: share of the time that the record lies in the prediction intervals")

@@ -25,7 +25,7 @@ from dfsm.models.signals import with_computed
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
-from dfsm.validation.results import ChannelError, spread
+from dfsm.validation.results import ChannelError, spread, training_spreads
 
 
 @dataclass(frozen=True)
@@ -151,18 +151,24 @@ def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
     diverged = sum(s.status is not Status.COMPLETED for s in simulations)
     pairs = list(zip((s.trajectory for s in simulations), course.references, strict=True))
     measured = [c.name for c in model.signals.observed if c.name in course.references[0]]
-    nrmse = {
-        n: None
-        if diverged
-        else float(np.mean([ChannelError.of(x[n], r[n]).nrmse for x, r in pairs]))
-        for n in measured
-    }
+    usual = training_spreads(model)
+    nrmse = {n: None if diverged else _mean_nrmse(pairs, n, usual[n]) for n in measured}
     return Outcome(
         nrmse=nrmse,
         diverged=diverged,
         simulate_seconds=float(np.mean([s.wall_time for s in simulations])),
         parameters=Parametrization.of(model, np.ones(len(model.signals.observed))).size,
     )
+
+
+def _mean_nrmse(
+    pairs: Sequence[tuple[Trajectory, Mapping[str, Array]]], name: str, usual: float
+) -> float:
+    """Over the runs in which a state moves; over all where it moves in none."""
+    errors = [(ChannelError.of(x[name], r[name]), r[name]) for x, r in pairs]
+    moving = [e.unless_still(recorded, usual).nrmse for e, recorded in errors]
+    known = [v for v in moving if not np.isnan(v)]
+    return float(np.mean(known or [e.nrmse for e, _ in errors]))
 
 
 def _reference(run: Trajectory, settings: FitSettings) -> dict[str, Array]:

@@ -7,6 +7,7 @@ the start of the window. States and outputs are then compared along the model's 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from dfsm.validation.results import (
     ModelRun,
     RunComparison,
     Validation,
+    training_spreads,
 )
 
 # Frequency ranges in Hz in which peaks are compared; blade passing is added where a rotor speed
@@ -101,7 +103,7 @@ def validate(
     for run in track(runs, "test runs"):
         results.append(_compare(models, run, (start, stop), settings, intervals))
     channels = (*first.signals.observed, *first.signals.outputs)
-    return Validation(
+    validation = Validation(
         models=dict(models),
         channels=channels,
         runs=tuple(results),
@@ -111,6 +113,7 @@ def validate(
         warnings=tuple(notes),
         intervals=intervals,
     )
+    return replace(validation, warnings=(*notes, *validation.still()))
 
 
 def compared(model: DFSM, nonlinear: DFSM | None = None) -> dict[str, DFSM]:
@@ -143,6 +146,7 @@ def _compare(
     rows = np.isin(rates.trajectory.time, inside.time)
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
+    usual = training_spreads(first)
     results = {}
     for name, model in models.items():
         simulation = _simulate_warm(model, run, window, settings)
@@ -155,7 +159,8 @@ def _compare(
         band, coverage = None, {}
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
-                errors[c.name] = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
+                error = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
+                errors[c.name] = error.unless_still(recorded[c.name], usual.get(c.name, 0.0))
             statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
