@@ -18,7 +18,18 @@ import typer
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
-from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
+from dfsm.cli.terminal import (
+    AsJson,
+    Files,
+    ParameterFile,
+    Quiet,
+    fit_start,
+    lines,
+    parametrized,
+    print_json,
+    say,
+    working,
+)
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
@@ -139,8 +150,10 @@ def compare(
     check_output(output, candidates)
     files, hold_out = settings.compare.validation, settings.compare.hold_out
     with working(quiet):
-        runs = read_all(settings.data.train, config.parent)
-        validation = None if files is None else read_all(files, config.parent)
+        runs = settings.with_parameters(read_all(settings.data.train, config.parent))
+        validation = None
+        if files is not None:
+            validation = settings.with_parameters(read_all(files, config.parent))
         ranking = run_compare(
             candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
         )
@@ -183,6 +196,7 @@ def validate(
     ] = None,
     stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
     intervals: IntervalFile = None,
+    parameters: ParameterFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate test runs, compare with what was recorded, write a report."""
@@ -203,9 +217,9 @@ def validate(
     start = fit_start(main) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     with working(quiet):
-        runs = read_all(files)
+        runs = parametrized(read_all(files), parameters)
         for path in targets:
-            check_file(path, [wall_times, intervals, *(r.source for r in runs)])
+            check_file(path, [wall_times, intervals, parameters, *(r.source for r in runs)])
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
@@ -235,15 +249,24 @@ def simulate(
         float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
     ] = None,
     intervals: IntervalFile = None,
+    parameters: ParameterFile = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help='Change a channel: "NAME = 2", or +=, -=, *=; run\'s units.'),
+    ] = None,
+    inputs: Annotated[
+        str | None, typer.Option(help="Table whose columns replace inputs of the run.")
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate the model with the inputs of one run and write states and outputs."""
+    """Simulate the model with the inputs of one run, or others, and write states and outputs."""
     from dfsm.core.files import check_file
     from dfsm.data.readers import read
     from dfsm.data.readers.tables import table_suffix, write_table
     from dfsm.models.completion import completed
     from dfsm.models.model_folder import load
+    from dfsm.models.what_if import with_changes, with_inputs
     from dfsm.simulation.simulate import METHODS, SimulationSettings
     from dfsm.simulation.simulate import simulate as run_simulate
     from dfsm.validation.intervals import load_intervals
@@ -251,14 +274,18 @@ def simulate(
     if method not in METHODS:
         raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
     table_suffix(output)
-    check_file(output, [path for path in (run, intervals) if path and Path(path).exists()])
+    check_file(output, [path for path in (run, inputs, intervals) if path and Path(path).exists()])
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     if calibrated is not None:
         calibrated.check(surrogate)
     with working(quiet):
-        recorded = completed(read(run), surrogate.signals)
+        recorded = parametrized([read(run)], parameters)[0]
+        if inputs is not None:
+            recorded = with_inputs(recorded, read(inputs), surrogate.signals, start, stop)
+        recorded = with_changes(recorded, changes or (), surrogate.signals)
+        recorded = completed(recorded, surrogate.signals)
     with working(quiet), hushed():  # the outcome is printed below
         result = run_simulate(
             surrogate,

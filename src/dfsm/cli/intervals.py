@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from dfsm.cli.terminal import Files, Quiet, fit_start, say, working
+from dfsm.cli.terminal import (
+    Files,
+    ParameterFile,
+    Quiet,
+    fit_start,
+    parametrized,
+    say,
+    working,
+)
 
 
 def calibrate(
@@ -19,6 +27,7 @@ def calibrate(
     ] = 0.9,
     start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
+    parameters: ParameterFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Find how far off rollouts are, on runs that had no part in the fit; at least three."""
@@ -32,8 +41,8 @@ def calibrate(
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     with working(quiet):
-        runs = read_all(files)
-        check_file(output, [*model.iterdir(), *(run.source for run in runs)])
+        runs = parametrized(read_all(files), parameters)
+        check_file(output, [*model.iterdir(), parameters, *(run.source for run in runs)])
         intervals = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
     intervals.save(output)
     if not quiet:

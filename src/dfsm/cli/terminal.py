@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,11 +14,22 @@ from dfsm.core.progress import show_progress
 from dfsm.errors import hushed, printable
 
 if TYPE_CHECKING:
+    from dfsm.data.trajectory import Trajectory
     from dfsm.models.dfsm import DFSM
 
 Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+ParameterFile = Annotated[
+    Path | None, typer.Option("--parameters", help="CSV: a column of runs, one per parameter.")
+]
+
+
+def parametrized(runs: list[Trajectory], table: Path | None) -> list[Trajectory]:
+    """Runs with the parameters of a table, if there is one."""
+    from dfsm.data.parameters import read_parameters, with_parameters
+
+    return runs if table is None else with_parameters(runs, read_parameters(table))
 
 
 @contextmanager

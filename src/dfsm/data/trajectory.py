@@ -6,6 +6,7 @@ Arrays are ``(time, channel)``; stacked over runs they are ``(sample, channel)``
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -252,13 +253,44 @@ class Trajectory:
             wall_time=None if self.wall_time is None else self.wall_time * part,
         )
 
-    def with_channels(self, channels: Sequence[Channel], values: ArrayLike) -> Trajectory:
-        """Append channels; `values` has shape ``(time, len(channels))``."""
-        values = np.asarray(values, dtype=np.float64).reshape(len(self), len(channels))
-        return replace(
+    def with_channels(
+        self,
+        channels: Sequence[Channel | str] | Channel | str,
+        values: ArrayLike,
+        *,
+        replace: bool = False,
+    ) -> Trajectory:
+        """Append channels, or put others in the place of those that the run has.
+
+        Parameters
+        ----------
+        channels
+            Channels, or names: a channel of the run then keeps its unit and role.
+        values
+            Samples, shape ``(time, len(channels))``, or one number for all times.
+        replace
+            Whether channels that the run has are replaced; they are refused otherwise.
+
+        Raises
+        ------
+        DfsmError
+            Another shape, what is no channel or number, or a name that is taken.
+        """
+        added = _described(self, channels)
+        taken = [c.name for c in added if c.name in self]
+        if taken and not replace:
+            raise DfsmError(
+                f"{self.where}: channel '{taken[0]}' stands there twice: rename one, or replace "
+                "it with replace=True"
+            )
+        values = np.concatenate([self.values, _samples(self, values, added)], axis=1)
+        every = (*self.channels, *added)
+        # A name keeps its first place and takes its last column.
+        columns = list({c.name: i for i, c in enumerate(every)}.values()) if taken else slice(None)
+        return dataclasses.replace(
             self,
-            values=np.concatenate([self.values, values], axis=1),
-            channels=(*self.channels, *channels),
+            values=values[:, columns],
+            channels=tuple(every[i] for i in columns) if taken else every,
         )
 
     def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
@@ -363,6 +395,34 @@ class Trajectory:
             raise DfsmError(f"{where}: the index is not time in s; set it to the time") from None
         channels = tuple(Channel(str(c), known.get(str(c), "")) for c in frame.columns)
         return cls(time, np.stack(columns, axis=1), channels, name=name, source=source)
+
+
+def _described(run: Trajectory, channels: Sequence[Channel | str] | Channel | str) -> list[Channel]:
+    listed = [channels] if isinstance(channels, Channel | str) else list(channels)
+    for c in listed:
+        if not isinstance(c, Channel | str):
+            raise DfsmError(f"{run.where}: {c!r} is no channel: give a Channel, or its name")
+    names = [c if isinstance(c, str) else c.name for c in listed]
+    # New samples do not lie on the grid of those that a file held.
+    known = {n: replace(run.channel(n), step=None) for n in names if n in run}
+    return [known.get(c, Channel(c)) if isinstance(c, str) else c for c in listed]
+
+
+def _samples(run: Trajectory, values: ArrayLike, channels: Sequence[Channel]) -> Array:
+    """Samples of some channels, ``(time, channel)``."""
+    shape, told = (len(run), len(channels)), ", ".join(c.name for c in channels)
+    try:
+        samples = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DfsmError(
+            f"{run.where}: the samples of {told} are no numbers: give numbers"
+        ) from None
+    if samples.ndim and samples.size != shape[0] * shape[1]:
+        raise DfsmError(
+            f"{run.where}: the samples of {told} have shape {samples.shape}, expected {shape}, or "
+            "one number"
+        )
+    return samples.reshape(shape) if samples.ndim else np.full(shape, samples)
 
 
 def _check_time(time: Array, where: str) -> None:

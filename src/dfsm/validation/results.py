@@ -220,24 +220,20 @@ class Validation:
         return float(np.mean(known)) if known and len(values) == len(self.runs) else None
 
     def still(self) -> list[str]:
-        """One sentence per channel that hardly moves in some runs, which have no NRMSE there."""
-        sentences = []
+        """One sentence on channels that hardly move in some runs, and have no NRMSE there."""
+        still: dict[tuple[str, ...], list[str]] = {}
         for c in self.channels:
-            runs = [
-                r.recorded.where
-                for r in self.runs
-                if any(
-                    c.name in m.errors and np.isnan(m.errors[c.name].nrmse)
-                    for m in r.models.values()
-                )
-            ]
-            if runs:
-                shown = ", ".join(runs[:3]) + (", …" if len(runs) > 3 else "")
-                sentences.append(
-                    f"'{c.name}' hardly moves in {shown} (less than {_STILL:.0%} of its spread in "
-                    "training): no NRMSE there and none in the mean, see the RMSE"
-                )
-        return sentences
+            errors = ([m.errors.get(c.name) for m in r.models.values()] for r in self.runs)
+            at = [any(e is not None and np.isnan(e.nrmse) for e in run) for run in errors]
+            runs = tuple(r.recorded.where for r, rests in zip(self.runs, at, strict=True) if rests)
+            still.setdefault(runs, []).append(f"'{c.name}'")
+        return [
+            f"{', '.join(names)}: less than {_STILL:.0%} of the spread in training in "
+            f"{', '.join(runs[:3])}{', …' if len(runs) > 3 else ''}, so no NRMSE there and none "
+            "in the mean: see the RMSE"
+            for runs, names in still.items()
+            if runs
+        ]
 
     def coverage(self, channel: str) -> list[float] | None:
         """Share of the time inside the prediction intervals per run; None as for `mean_nrmse`."""
