@@ -46,7 +46,9 @@ signals:
   # Disturbances computed from others: a rate, or a first-order lag of so many seconds, as in
   # [{{source: Wave1Elev, kind: rate}}, {{source: RotWind, kind: lag, time_constant: 10}}]
   features: []
-  parameters: {parameters}       # plant variables, constant within a run
+  # Plant variables, constant within a run: channels, or values of runs whose files hold none, as
+  # {{Ballast: {{run1.outb: 1.0, run2.outb: 1.2}}}} or the name of a CSV table.
+  parameters: {parameters}
   outputs: {outputs}
 
 derivatives:
