@@ -185,7 +185,7 @@ def _read(text: str) -> Unit:
     try:
         scale, powers, end = _product(text, 0)
     except _NoUnitError:
-        end = -1
+        scale, powers, end = 1.0, _Powers(), -1
     if end != len(text):
         # Something else than a unit in brackets: nothing is known but its letters.
         return Unit(1.0, 0.0, ((" ".join(text.split()), 1.0),))

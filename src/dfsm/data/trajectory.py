@@ -285,13 +285,11 @@ class Trajectory:
             )
         values = np.concatenate([self.values, _samples(self, values, added)], axis=1)
         every = (*self.channels, *added)
-        # A name keeps its first place and takes its last column.
-        columns = list({c.name: i for i, c in enumerate(every)}.values()) if taken else slice(None)
-        return dataclasses.replace(
-            self,
-            values=values[:, columns],
-            channels=tuple(every[i] for i in columns) if taken else every,
-        )
+        columns = list(range(len(every)))
+        if taken:  # a name keeps its first place and takes its last column
+            columns = list({c.name: i for i, c in enumerate(every)}.values())
+            values = values[:, columns]
+        return dataclasses.replace(self, values=values, channels=tuple(every[i] for i in columns))
 
     def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
         """Set the roles of the named channels; the others keep theirs."""
