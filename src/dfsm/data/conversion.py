@@ -61,7 +61,9 @@ def in_units_of(
     if values is None:
         return run
     note = f"{_NOTE}{', '.join(dict.fromkeys(told))}, as in {whose}"
-    return replace(run, values=values, channels=tuple(described), notes=(*run.notes, note))
+    # Features are computed, and converted, each time that a run is completed.
+    notes = run.notes if note in run.notes else (*run.notes, note)
+    return replace(run, values=values, channels=tuple(described), notes=notes)
 
 
 def converted(before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
