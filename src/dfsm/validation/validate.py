@@ -14,6 +14,7 @@ import numpy as np
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
+from dfsm.core.units import factor
 from dfsm.data.conversion import converted
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
@@ -223,7 +224,7 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
     """
     azimuth = model.signals.azimuth
     if azimuth is None:
-        speeds = [c.name for c in model.signals.states if c.unit == "rpm"]
+        speeds = [c.name for c in model.signals.states if factor(c.unit, "rpm") == 1]
         azimuth = Azimuth(speed=speeds[0]) if speeds else None
     if azimuth is None:
         return PLATFORM, WAVE, LOW
