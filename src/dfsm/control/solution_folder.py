@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 from dfsm.control.mesh.grid import Grid
 from dfsm.control.solution import Ending, Optimality, Replay, Solution
 from dfsm.core.bundle import MANIFEST, Bundle
-from dfsm.core.files import check_folder
+from dfsm.core.exchange import recover
+from dfsm.core.files import check_folder, visible
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -41,7 +42,11 @@ _PLAIN = (
 )
 
 
-def save_solution(solution: Solution, path: str | Path) -> None:
+def save_solution(
+    solution: Solution,
+    path: str | Path,
+    page: Callable[[Solution, Path], object] | None = None,
+) -> None:
     """Write a solution folder; an existing solution folder there is replaced in one step.
 
     Parameters
@@ -50,6 +55,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         From `solve`.
     path
         Folder to make.
+    page
+        Writes a page about the solution to a file, which becomes part of the folder.
 
     Raises
     ------
@@ -74,7 +81,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
     }
     if solution.optimality is not None:
         content["optimality"] = asdict(solution.optimality)
-    _BUNDLE.write(path, tensors, content, _is_solution)
+    pages = {} if page is None else {PAGE: lambda file: page(solution, file)}
+    _BUNDLE.write(path, tensors, content, _is_solution, pages)
 
 
 def check_solution_target(path: str | Path) -> None:
@@ -96,6 +104,7 @@ def load_solution(path: str | Path) -> Solution:
         The folder is missing, no solution, damaged, or written by a newer version.
     """
     path = Path(path)
+    recover(path)
     if not path.is_dir() or not _is_solution(path):
         raise DfsmError(f"{path} is no folder of a solution as save_solution makes it")
     manifest = _BUNDLE.read_manifest(path)
@@ -165,4 +174,4 @@ def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _is_solution(path: Path) -> bool:
-    return {p.name for p in path.iterdir()} - {PAGE} == {MANIFEST, TENSORS}
+    return visible(path) - {PAGE} == {MANIFEST, TENSORS}

@@ -16,7 +16,8 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from dfsm.core.bundle import MANIFEST, Bundle
-from dfsm.core.files import check_folder
+from dfsm.core.exchange import recover
+from dfsm.core.files import check_folder, visible
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
@@ -235,10 +236,11 @@ def _put_together(
 
 def _is_model(path: Path) -> bool:
     # Both files: other programs write a manifest.json too.
-    return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
+    return visible(path) == {MANIFEST, TENSORS}
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
+    recover(path)
     if not path.is_dir():
         kind = "a file" if path.exists() else "missing"
         raise DfsmError(f"{path} is {kind}; a model folder as 'dfsm fit' writes it was expected")

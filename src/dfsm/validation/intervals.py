@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from dfsm.core.bundle import is_as_written, signed
 from dfsm.core.files import check_format, existing_file, write_json
 from dfsm.core.types import Array
 from dfsm.core.version import __version__
@@ -22,6 +23,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.simulation.simulate import Simulation
 
 _FORMAT = 1
+_UNSIGNED = ("format", "dfsm", "level", "schedule", "grid", "channels", "runs", "warnings")
 _AGAIN = "make it again with dfsm calibrate"
 
 
@@ -138,7 +140,7 @@ class Intervals:
             "runs": [{"name": name, "sha256": digest} for name, digest in runs],
             "warnings": self.warnings,
         }
-        write_json(path, content)
+        write_json(path, signed(content))
 
 
 class _Channel(BaseModel):
@@ -188,6 +190,8 @@ def load_intervals(path: str | Path) -> Intervals:
     version = raw.get("format") if isinstance(raw, dict) else None
     if isinstance(version, int):
         check_format(path, version, _FORMAT)
+    if isinstance(raw, dict) and version is not None and not is_as_written(raw, _UNSIGNED):
+        raise DfsmError(f"{path} is damaged, it is not as it was written: {_AGAIN}")
     try:
         content = _File.model_validate(raw)
     except ValidationError as error:
