@@ -190,8 +190,6 @@ def load_intervals(path: str | Path) -> Intervals:
     version = raw.get("format") if isinstance(raw, dict) else None
     if isinstance(version, int):
         check_format(path, version, _FORMAT)
-    if isinstance(raw, dict) and version is not None and not is_as_written(raw, _UNSIGNED):
-        raise DfsmError(f"{path} is damaged, it is not as it was written: {_AGAIN}")
     try:
         content = _File.model_validate(raw)
     except ValidationError as error:
@@ -203,6 +201,8 @@ def load_intervals(path: str | Path) -> Intervals:
     points = len(content.grid)
     if any(len(c.half_width) != points for c in content.channels):
         raise _foreign(path, f"a channel has not one half-width for each of {points} grid points")
+    if not is_as_written(raw, _UNSIGNED):
+        raise DfsmError(f"{path} is damaged, it is not as it was written: {_AGAIN}")
     return Intervals(
         channels=tuple(c.name for c in content.channels),
         units=tuple(c.unit for c in content.channels),
