@@ -75,16 +75,18 @@ def _in_two_steps(new: Path, path: Path) -> None:
             old.rename(path)
         raise
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        # What could not go back is all that there is: `recover` finds it.
+        if path.exists():
+            shutil.rmtree(aside, ignore_errors=True)
 
 
-def temporary_folder(path: Path) -> Path:
-    """Make an empty folder beside `path` whose content is to take its place."""
-    return Path(tempfile.mkdtemp(prefix=f".{path.name}.new-", dir=path.parent))
+def beginning(path: Path) -> str:
+    """How the names of temporary files and folders begin that are to take the place of `path`."""
+    return f".{path.name}.dfsm-new-"
 
 
 def _aside(path: Path) -> str:
-    return f".{path.name}.old-"
+    return f".{path.name}.dfsm-old-"
 
 
 def recover(path: Path) -> None:
@@ -93,29 +95,29 @@ def recover(path: Path) -> None:
     Call it before `path` is read or replaced. Where another process is writing, or nothing was
     left, it does nothing.
     """
-    if not any(_left(path)):
+    if not _left(path):
         return
     try:
         with locked(path):
             for aside in sorted(path.parent.glob(f"{escape(_aside(path))}*")):
                 if not path.exists() and (aside / "replaced").is_dir():
                     (aside / "replaced").rename(path)
-            for left in list(_left(path)):
-                shutil.rmtree(left, ignore_errors=True)
+            for left in _left(path):
+                if left.is_dir():
+                    shutil.rmtree(left, ignore_errors=True)
+                else:
+                    left.unlink(missing_ok=True)
     except (DfsmError, OSError):
         return
 
 
 def _left(path: Path) -> list[Path]:
     try:
-        return [
-            folder
-            for start in (_aside(path), f".{path.name}.new-")
-            for folder in path.parent.glob(f"{escape(start)}*")
-            if folder.is_dir() and not folder.is_symlink()
-        ]
+        starts = (escape(start) for start in (_aside(path), beginning(path)))
+        found = [p for start in starts for p in path.parent.glob(f"{start}*")]
     except OSError:
         return []
+    return [p for p in found if not p.is_symlink()]
 
 
 def settle(path: Path) -> None:

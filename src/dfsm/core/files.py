@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dfsm.core.exchange import exchange, recover, settle, settle_names, temporary_folder
+from dfsm.core.exchange import beginning, exchange, recover, settle, settle_names
 from dfsm.core.lock import locked
 from dfsm.core.version import __version__
 from dfsm.errors import DfsmError, near_matches
@@ -28,14 +28,16 @@ def write_file(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     DfsmError
-        The folder does not exist, cannot be written, or the disk is full.
+        The folder does not exist, cannot be written, the disk is full, or another process is
+        writing the file.
     """
     path = Path(path)
     _check_ordinary(path)
     # The file that a link points to is replaced, not the link.
     path = path.resolve() if path.is_symlink() else path
-    with _sentences(path):
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    with _sentences(path), locked(path):
+        recover(path)
+        handle, name = tempfile.mkstemp(prefix=beginning(path), dir=path.parent)
         os.close(handle)
         temporary = Path(name)
         try:
@@ -68,7 +70,7 @@ def write_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> Iterat
     path = path.resolve() if path.is_symlink() else path
     with _sentences(path), locked(path):
         recover(path)
-        temporary = temporary_folder(path)
+        temporary = Path(tempfile.mkdtemp(prefix=beginning(path), dir=path.parent))
         try:
             yield temporary
             temporary.chmod(0o777 & ~_umask())

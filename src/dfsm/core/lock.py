@@ -22,7 +22,7 @@ _held: dict[Path, int] = {}
 def locked(path: str | Path) -> Iterator[None]:
     """Keep other processes from writing to `path`, a file or folder that need not exist.
 
-    The lock is a file ``.NAME.lock`` beside it, gone afterwards. One that a killed process left
+    The lock is a file ``.NAME.dfsm-lock`` beside it, gone afterwards. One that a killed process left
     behind locks nothing. Where no such file can be made, nobody is kept out. A process may take
     a lock again that it holds.
 
@@ -32,7 +32,7 @@ def locked(path: str | Path) -> Iterator[None]:
         Another process holds the lock.
     """
     place = Path(path).absolute()
-    file = place.with_name(f".{place.name}.lock")
+    file = place.with_name(f".{place.name}.dfsm-lock")
     handle = None if fcntl is None or place in _held else _acquire(file, Path(path))
     _held[place] = _held.get(place, 0) + 1
     try:
