@@ -13,7 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from dfsm.core.bundle import MANIFEST, Bundle
 from dfsm.core.exchange import recover
@@ -22,6 +22,7 @@ from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
 from dfsm.models.dfsm import DFSM
+from dfsm.models.folder_check import RecordCheck, check_model
 from dfsm.models.linear import LinearModel
 from dfsm.models.passing import Passing
 from dfsm.models.region import Region
@@ -106,16 +107,20 @@ def load_all(
     manifest = _read_manifest(path)
     tensors = _BUNDLE.read_tensors(path, manifest)
     try:
-        signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
-        provenance = Provenance(manifest["provenance"])
-        return {
+        signals, provenance = _about(manifest)
+        models = {
             name: _put_together(structure, name, tensors, (signals, provenance), functions or {})
             for name, structure in manifest["models"].items()
         }
-    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        if MULTI_FIDELITY not in models:
+            raise KeyError(MULTI_FIDELITY)
+        for model in models.values():
+            check_model(model)
+    except _GARBLED as error:
         raise _BUNDLE.damaged(
             path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]
         ) from None
+    return models
 
 
 # -- taking apart and putting together ----------------------------------------------------------
@@ -164,6 +169,21 @@ _REGION = ("low", "high", "mean", "std", "grid", "operating", "whitening")
 _NO_DENSITY = np.zeros((0, 0, 0))  # of models that were saved before they had one
 _LINEAR = ("grid", "coefficients", "offsets")
 _PASSING = ("coefficients", "speed", "schedule")
+
+
+# What Python, JAX and pydantic say of parts that do not fit together.
+_GARBLED = (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError)
+
+
+def _about(manifest: Mapping[str, Any]) -> tuple[SignalTable, Provenance]:
+    """Signals and history, checked."""
+    try:
+        signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
+    except DfsmError as error:
+        # Of a settings class, which speaks of a configuration.
+        raise ValueError(f"signals ({error})") from None
+    RecordCheck.model_validate(manifest["provenance"])
+    return signals, Provenance(manifest["provenance"])
 
 
 def _put_together(
