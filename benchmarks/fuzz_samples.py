@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from dfsm.config.control import ControlConfig
@@ -27,7 +28,8 @@ from dfsm.data.readers.tables import write_table
 from dfsm.data.readers.turbsim import read_turbsim
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from dfsm.models.model_folder import load_all, save as save_model
+from dfsm.models.model_folder import load_all
+from dfsm.models.model_folder import save as save_model
 from dfsm.selection.compare import _read as read_result
 from dfsm.validation.intervals import Intervals, load_intervals
 
@@ -102,7 +104,7 @@ def _tables(folder: Path) -> list[Sample]:
         found.append(_file(name, (folder / name).read_bytes(), _said, folder, checked=kept))
     found.append(_file("run.out", _out(run), _said, folder))
     found.append(_file("run.outb", _outb(run), _said, folder))
-    found.append(_file("field.bts", _bts(), _wind, folder))
+    found.append(_file("field.bts", wind_field(), _wind, folder))
     found.append(_file("rotor.txt", _rotor(), lambda p: read_rotor_table(p).cp.tolist(), folder))
     return found
 
@@ -138,7 +140,8 @@ def _outb(run: Trajectory) -> bytes:
     return b"".join([*parts, codes.tobytes()])
 
 
-def _bts() -> bytes:
+def wind_field() -> bytes:
+    """A small TurbSim field."""
     codes = np.random.default_rng(0).integers(-3000, 3000, (40, 3 * 16)).astype("<i2")
     head = struct.pack("<h4i", 7, 4, 4, 0, 40)
     head += struct.pack("<6f", 10.0, 10.0, 0.1, 10.0, 90.0, 75.0)
@@ -275,9 +278,7 @@ def _folders(folder: Path) -> list[Sample]:
         )
         for part, file, sign in parts:
             put = _replacing(source, file.name)
-            found.append(
-                Sample(f"{name} {part}", file.read_bytes(), put, reader, told, True, sign)
-            )
+            found.append(Sample(f"{name} {part}", file.read_bytes(), put, reader, told, True, sign))
         tensors = load_file(arrays)
         shapes = {key: [*value.shape, str(value.dtype)] for key, value in tensors.items()}
         put, raw = _reshaping(source, arrays.name, tensors), json_bytes(shapes)
@@ -315,10 +316,9 @@ def _reshaping(
     def put(damaged: bytes, where: Path) -> Path:
         try:
             shapes = json.loads(damaged)
-            arrays = {k: _cut(tensors.get(k, np.zeros(1)), *v) for k, v in shapes.items()}
-        except (ValueError, TypeError, AttributeError, MemoryError, OverflowError):
-            arrays = dict(tensors)
-        raw = save(arrays)
+            raw = save({k: _cut(tensors.get(k, np.zeros(1)), *v) for k, v in shapes.items()})
+        except (ValueError, TypeError, AttributeError, OverflowError, SafetensorError):
+            raw = save(dict(tensors))  # shapes that no file can hold
         target = _replacing(source, name)(raw, where)
         manifest = json.loads((target / MANIFEST).read_bytes())
         manifest["sha256"] = hashlib.sha256(raw).hexdigest()

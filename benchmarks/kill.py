@@ -1,4 +1,4 @@
-"""Kill every command at every file event: is what stands at its target whole, old or new?
+"""Kill every command at every file event: what stands at its target must be whole, old or new.
 
 A command is run again and again in copies of one folder, killed before its first, second, … event
 on a file, until it ends by itself. Each time its target must be what it was or what it is to be,
@@ -22,9 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import dfsm
 from dfsm.core.bundle import checksum
 from dfsm.core.exchange import recover
+from dfsm.data.readers.tables import write_table
+from dfsm.data.trajectory import Channel, Trajectory
 
 # What Python does to files; writing itself is between the events, in temporary files.
 EVENTS = {
@@ -205,3 +209,90 @@ def is_whole(found: Mapping[str, bytes], expected: Mapping[str, bytes]) -> bool:
         elif raw[-8:] != expected[name][-8:]:
             return False
     return True
+
+
+def run() -> dict[str, Any]:
+    """Kill every command that writes, and let it meet a full disk, at every event.
+
+    Returns
+    -------
+    dict
+        Per command the number of events and what went wrong.
+    """
+    commands: dict[str, tuple[str, ...]] = {
+        "new.yaml": ("init", "train/*", "-o", "new.yaml", "--force"),
+        "m": ("fit", "config.yaml", "-o", "m", "-q"),
+        "r.html": ("validate", "model", "test.csv", "-o", "r.html", "-q"),
+        "r.json": ("validate", "model", "test.csv", "--json", "r.json", "-q"),
+        "o.csv": ("simulate", "model", "test.csv", "-o", "o.csv", "-q"),
+        "o.parquet": ("simulate", "model", "test.csv", "-o", "o.parquet", "-q"),
+        "i.json": ("calibrate", "model", "held/*", "-o", "i.json", "-q"),
+        "s": ("optimize", "problem.yaml", "-o", "s", "-q"),
+        "c": ("export-rosco", "solution", "-o", "c"),
+        "w": ("wind", "field.bts", "train/a.csv", "--radius", "12", "-o", "w", "-q"),
+        "all": ("compare", "config.yaml", "-o", "all", "--jobs", "1", "-q"),
+    }
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as base:
+        source = Path(base) / "source"
+        _prepare(source)
+        for target, arguments in commands.items():
+            for full in (False, True):
+                events, wrong = killed_everywhere(command(*arguments), source, target, full=full)
+                name = f"{arguments[0]} {target}{' on a full disk' if full else ''}"
+                figures[name] = {"events": events, "wrong": wrong}
+                print(f"{name}: {events} events, {len(wrong)} wrong", file=sys.stderr, flush=True)
+    return figures
+
+
+_CONFIG = """\
+data: {train: [train/a.csv, train/b.csv, train/c.csv]}
+signals: {states: [{name: q, order: 2}], controls: [Torque], disturbances: [RotWind], outputs: [y]}
+corrective: {kind: none}
+nonlinear_only: false
+compare: {candidates: {raw: {linear: {kind: LTI, affine: false}}}, hold_out: 0.3}
+"""
+_PROBLEM = """\
+model: model
+horizon: [0, 4]
+disturbances: test.csv
+cost: [{weight: 1, track: q, reference: 0.2}, {weight: 0.1, square: Torque}]
+bounds: {Torque: [-2, 2]}
+initial: recorded
+nodes: 11
+"""
+
+
+def _prepare(source: Path) -> None:
+    """Runs of an oscillator, a configuration, a model, a solution and a wind field."""
+    from benchmarks.fuzz_samples import wind_field
+
+    for part in ("train", "held"):
+        (source / part).mkdir(parents=True)
+    for k, name in enumerate(("train/a", "train/b", "train/c", "held/d", "held/e", "held/f")):
+        write_table(_oscillator(k), source / f"{name}.csv")
+    write_table(_oscillator(9), source / "test.csv")
+    (source / "field.bts").write_bytes(wind_field())
+    (source / "config.yaml").write_text(_CONFIG)
+    (source / "problem.yaml").write_text(_PROBLEM)
+    for arguments in (
+        ("fit", "config.yaml", "-o", "model", "-q"),
+        ("optimize", "problem.yaml", "-o", "solution", "-q"),
+    ):
+        done = command(*arguments)(source, _NEVER, False)
+        if done.code:
+            raise RuntimeError(done.err)
+
+
+def _oscillator(seed: int) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 6.0, 0.05)
+    a, b, c = rng.uniform(0.5, 2.5, 3)
+    torque, wind = np.sin(a * time), np.cos(b * time) + 0.3 * np.sin(3 * c * time)
+    q, v, values = 0.2, 0.0, []
+    for u, w in zip(torque, wind, strict=True):
+        values.append([q, u, w, 2 * q - u])
+        v += 0.05 * (-q - 0.4 * v + u + 0.5 * w)
+        q += 0.05 * v
+    channels = tuple(Channel(*c) for c in (("q", "m"), ("Torque", "kNm"), ("RotWind", "m/s")))
+    return Trajectory(time, np.array(values), (*channels, Channel("y", "kN")), name=f"run{seed}")

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from conftest import files_of
-from dfsm.core.exchange import recover, swap
+from dfsm.core.exchange import swap
 from dfsm.core.fallback import write_or_keep
 from dfsm.core.files import check_folder, write_file, write_folder
 from dfsm.core.lock import locked

@@ -22,7 +22,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from dfsm.errors import DfsmError
 
 # Far more than any configuration has; the reader takes seconds for so many.
-MOST_CHARACTERS, MOST_VALUES, MOST_LEVELS = 1_000_000, 50_000, 40
+MOST_CHARACTERS, MOST_VALUES, MOST_LEVELS = 1_000_000, 20_000, 40
 # Whole numbers beyond are none that the arrays of a computation can hold.
 _LARGEST = 2**63 - 1
 _TAG = "tag:yaml.org,2002:"

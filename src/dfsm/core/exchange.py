@@ -51,7 +51,9 @@ def swap(one: Path, other: Path) -> bool:
     OSError
         The system can, but did not.
     """
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if os.name != "nt" else None
+    call = (
+        getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if os.name != "nt" else None
+    )
     if call is None:
         return False
     names = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))

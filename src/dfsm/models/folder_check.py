@@ -196,4 +196,3 @@ def _columns(what: str, columns: Iterable[Any], count: int) -> None:
     for column in columns:
         if type(column) is not int or not 0 <= column < count:
             raise ValueError(f"{what}, which names column {column} of {count}")
-

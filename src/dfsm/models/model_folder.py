@@ -233,7 +233,10 @@ def _put_together(
     f = linear("f")
     if f is None:
         raise KeyError("f")
-    if not structure.get("latents", 0):
+    latents = structure.get("latents", 0)
+    if latents not in (0, len(signals.latents)):
+        raise ValueError(f"latents, which are {len(signals.latents)} in its signals")
+    if not latents:
         # The nonlinear-only model beside a refined one has none.
         signals = replace(signals, states=signals.observed, latents=())
     return DFSM(

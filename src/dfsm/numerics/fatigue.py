@@ -39,15 +39,18 @@ def damage_equivalent_load(
         A sample is NaN or infinite, there are none, or no time has passed.
     """
     values = np.asarray(values, dtype=np.float64)
+    if not len(values):
+        raise DfsmError("the load history has no samples, so no cycles: give a longer part")
     bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad) or not len(values):
-        told = f"{len(bad)} NaN or infinite samples, the first is number {bad[0] + 1}"
+    if len(bad):
         raise DfsmError(
-            f"the load history has {told if len(bad) else 'no samples'}, so its cycles cannot be "
-            "counted: leave that part of the run out"
+            f"the load history has {len(bad)} NaN or infinite samples, the first is number "
+            f"{bad[0] + 1}, so its cycles cannot be counted: leave that part of the run out"
         )
     if not duration > 0:
-        raise DfsmError(f"the load history lasts {duration:g} s, expected more than 0 s")
+        raise DfsmError(
+            f"the load history lasts {duration:g} s, expected more than 0 s: give its length"
+        )
     if np.ptp(values) == 0:
         return 0.0
     # From its maximum to its maximum nothing remains open after counting (ASTM E1049, 5.4.5);
