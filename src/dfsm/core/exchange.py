@@ -51,13 +51,12 @@ def swap(one: Path, other: Path) -> bool:
     OSError
         The system can, but did not.
     """
-    call = (
-        getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if os.name != "nt" else None
-    )
+    if os.name == "nt":
+        return False
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if call is None:
         return False
-    names = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))
-    first, second = names
+    first, second = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))
     if call(_AT_FDCWD, first, _AT_FDCWD, second, ctypes.c_uint(_RENAME_EXCHANGE)) == 0:
         return True
     number = ctypes.get_errno()

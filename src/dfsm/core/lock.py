@@ -22,9 +22,9 @@ _held: dict[Path, int] = {}
 def locked(path: str | Path) -> Iterator[None]:
     """Keep other processes from writing to `path`, a file or folder that need not exist.
 
-    The lock is a file ``.NAME.dfsm-lock`` beside it, gone afterwards. One that a killed process left
-    behind locks nothing. Where no such file can be made, nobody is kept out. A process may take
-    a lock again that it holds.
+    The lock is a file ``.NAME.dfsm-lock`` beside it, gone afterwards. One that a killed process
+    left behind locks nothing. Where no such file can be made, nobody is kept out. A process may
+    take a lock again that it holds.
 
     Raises
     ------
