@@ -208,7 +208,7 @@ def _warnings(trajectory: Trajectory) -> list[str]:
             continue
         h = hashlib.sha256()
         for part in _parts(values):
-            h.update(part)
+            h.update(part.data)
         data = h.digest()
         if data in seen:
             sentences.append(f"'{name}' holds the same data as '{seen[data]}'")
