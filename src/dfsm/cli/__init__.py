@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -104,16 +105,20 @@ def fit(
 ) -> None:
     """Fit a multi-fidelity model and save it as a folder."""
     from dfsm.config.fit import load_config
+    from dfsm.core.fallback import write_or_keep
+    from dfsm.core.files import visible
+    from dfsm.core.lock import locked
     from dfsm.fitting.fit import fit as run_fit
     from dfsm.models.model_folder import check_target, save
 
     check_target(output)
-    with working(quiet):
-        settings, runs = load_config(config)
-        result = run_fit(runs, settings.fit_settings(), settings.refine)
-        model = result.model
-    replaced = output.exists() and any(output.iterdir())
-    save(model, output, result.nonlinear)
+    with locked(output):
+        with working(quiet):
+            settings, runs = load_config(config)
+            result = run_fit(runs, settings.fit_settings(), settings.refine)
+            model = result.model
+        replaced = output.exists() and bool(visible(output))
+        write_or_keep(lambda path: save(model, path, result.nonlinear), output)
     if replaced and not quiet:
         print(printable(f"note: replaced the model that was in {output}"), file=sys.stderr)
     if as_json:
@@ -201,6 +206,7 @@ def validate(
 ) -> None:
     """Simulate test runs, compare with what was recorded, write a report."""
     from dfsm.cli.tables import print_validation
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file, write_json
     from dfsm.data.readers import read_all, with_wall_times
     from dfsm.models.model_folder import NONLINEAR, load_all
@@ -225,9 +231,10 @@ def validate(
         candidates = compared(main, models.get(NONLINEAR))
         validation = run_validate(candidates, runs, start=start, stop=stop, intervals=calibrated)
         if output is not None:
-            write_report({model.name or str(model): validation}, output)
+            label = model.name or str(model)
+            write_or_keep(lambda path: write_report({label: validation}, path), output)
     if metrics is not None:
-        write_json(metrics, validation.to_dict())
+        write_or_keep(lambda path: write_json(path, validation.to_dict()), metrics)
     if not quiet:
         print_validation(validation)
     for path in targets:
@@ -261,6 +268,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Simulate the model with the inputs of one run, or others, and write states and outputs."""
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file
     from dfsm.data.readers import read
     from dfsm.data.readers.tables import table_suffix, write_table
@@ -294,9 +302,8 @@ def simulate(
             stop=stop,
             settings=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
         )
-    write_table(
-        result.trajectory if calibrated is None else calibrated.beside(result, recorded), output
-    )
+    table = result.trajectory if calibrated is None else calibrated.beside(result, recorded)
+    write_or_keep(lambda path: write_table(table, path), output)
     if as_json:
         print_json(
             {
@@ -349,6 +356,15 @@ def two_link_robot(
 
 def main() -> None:
     """Run the command line; the only place that turns errors into exit codes."""
+    # Ended by a queue or a service manager, a command cleans up as after Ctrl-C.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        _main()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _main() -> None:
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DfsmWarning)
     if isinstance(sys.stdout, io.TextIOWrapper):

@@ -32,6 +32,7 @@ def calibrate(
 ) -> None:
     """Find how far off rollouts are, on runs that had no part in the fit; at least three."""
     from dfsm.cli.tables import print_intervals
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file
     from dfsm.data.readers import read_all
     from dfsm.models.model_folder import load
@@ -44,7 +45,7 @@ def calibrate(
         runs = parametrized(read_all(files), parameters)
         check_file(output, [*model.iterdir(), parameters, *(run.source for run in runs)])
         intervals = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
-    intervals.save(output)
+    write_or_keep(intervals.save, output)
     if not quiet:
         print_intervals(intervals)
     say(f"wrote {output}: give it to dfsm simulate or validate as --intervals {output}", quiet)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +13,7 @@ from dfsm.cli.terminal import Files, Quiet, say, working
 from dfsm.errors import DfsmError
 
 if TYPE_CHECKING:
+    from dfsm.data.trajectory import Trajectory
     from dfsm.data.wind_field import WindField
 
 Box = tuple[int, int, int, float, float, float]
@@ -53,6 +56,7 @@ def wind(
     quiet: Quiet = False,
 ) -> None:
     """Add the wind over the rotor, its slopes and harmonics to runs: disturbances to fit with."""
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file
     from dfsm.data.readers import read_all
     from dfsm.data.readers.tables import write_table
@@ -63,8 +67,8 @@ def wind(
     source = _open(field, box, told, last_first)
     with working(quiet):
         runs = read_all(files)
+        targets = _targets(runs, output)
         output.mkdir(parents=True, exist_ok=True)
-        targets = [output / f"{run.name}.parquet" for run in runs]
         for target in targets:
             check_file(target, [run.source for run in runs])
         signals = field_signals(source, radius, harmonics, radii)
@@ -72,8 +76,23 @@ def wind(
     more = "RotWind, RotShearV and RotShearH"
     more += f", and harmonics 1 to {harmonics} over rings" if harmonics else ""
     for run, target in zip(added, targets, strict=True):
-        write_table(run, target)
+        write_or_keep(partial(write_table, run), target)
         say(f"wrote {target} with {more}", quiet)
+
+
+def _targets(runs: Sequence[Trajectory], output: Path) -> list[Path]:
+    """One file per run, called after the file that it came from."""
+    taken: dict[str, Trajectory] = {}
+    for run in runs:
+        stem = Path(run.where).stem
+        # Systems differ in whether upper and lower case are different names.
+        other = taken.setdefault(stem.casefold(), run)
+        if other is not run:
+            raise DfsmError(
+                f"{other.where} and {run.where} would both be written to {output / stem}.parquet: "
+                "rename one of them, or write them to different folders"
+            )
+    return [output / f"{Path(run.where).stem}.parquet" for run in runs]
 
 
 def _radii(text: str) -> list[float]:

@@ -21,6 +21,9 @@ from dfsm.data.wind_field import ring_channel
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.inputs import GROUPS, InputOrder
 
+# More than any rotor has; harmonics are tried up to their number.
+_BLADES = 100
+
 
 @settings_class
 class Azimuth:
@@ -62,6 +65,7 @@ class Azimuth:
 
     def __post_init__(self) -> None:
         require(self.blades >= 1, "azimuth.blades", self.blades, "at least 1")
+        require(self.blades <= _BLADES, "azimuth.blades", self.blades, f"at most {_BLADES}")
         require(self.direction in (-1, 1), "azimuth.direction", self.direction, "-1 or 1")
         shown = [f"{r:g}" for r in self.rings]
         good = all(r > 0 for r in self.rings) and len({ring_channel("U", r) for r in self.rings})

@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from dfsm.core.bundle import is_as_written, signed
 from dfsm.core.files import check_format, existing_file, write_json
 from dfsm.core.types import Array
 from dfsm.core.units import agree
@@ -25,6 +26,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.simulation.simulate import Simulation
 
 _FORMAT = 1
+_UNSIGNED = ("format", "dfsm", "level", "schedule", "grid", "channels", "runs", "warnings")
 _AGAIN = "make it again with dfsm calibrate"
 
 
@@ -147,7 +149,7 @@ class Intervals:
             "runs": [{"name": name, "sha256": digest} for name, digest in runs],
             "warnings": self.warnings,
         }
-        write_json(path, content)
+        write_json(path, signed(content))
 
 
 class _Channel(BaseModel):
@@ -209,6 +211,8 @@ def load_intervals(path: str | Path) -> Intervals:
     points = len(content.grid)
     if any(len(c.half_width) != points for c in content.channels):
         raise _foreign(path, f"a channel has not one half-width for each of {points} grid points")
+    if not is_as_written(raw, _UNSIGNED):
+        raise DfsmError(f"{path} is damaged, it is not as it was written: {_AGAIN}")
     return Intervals(
         channels=tuple(c.name for c in content.channels),
         units=tuple(c.unit for c in content.channels),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -14,6 +16,7 @@ from dfsm.core.files import write_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import SECONDS, kept_columns, split_header, time_column
+from dfsm.data.readers.guard import check_run_name
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.errors import DfsmError
 
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 CODE_MIN, CODE_MAX = -32768, 32767
+# Key of the digest of all that is not in the pages.
+_HEADER = "dfsm.header"
 # How far, in steps, a sample may lie off the grid: rounding in float64 stays far below.
 GRID_SLACK = 1e-3
 # The codes' place in the 16-bit range is tried out where they leave room.
@@ -39,15 +44,16 @@ def read_parquet(path: Path) -> Trajectory:
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0][:160]
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         raise DfsmError(
             f"{path} is no readable Parquet file ({reason}): it is damaged or of another kind; "
             "write it again"
         ) from error
     schema = _texts(table.schema.metadata)
+    _check_header(path, table, schema)
     units = _pandas_units(schema)
     fields = [_with_shared(path, field, schema) for field in table.schema]
     channels = [_channel(path, field, units) for field in fields]
@@ -66,7 +72,7 @@ def read_parquet(path: Path) -> Trajectory:
         time,
         np.stack([columns[i] for i in keep], axis=1),
         [channels[i] for i in keep],
-        name=schema.get("dfsm.name"),
+        name=check_run_name(path, schema.get("dfsm.name", "")) or None,
         wall_time=_number(path, schema, "dfsm.wall_time") if "dfsm.wall_time" in schema else None,
         notes=(*_notes(path, schema), *notes),
     )
@@ -106,11 +112,36 @@ def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
             coded[channel.name] = "DELTA_BINARY_PACKED"
         fields.append(pa.field(channel.name, arrays[-1].type, metadata=known))
     table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=schema))
+    schema[_HEADER] = _header_digest(table)
+    table = table.replace_schema_metadata(schema)
     options: dict[str, Any] = {"compression": "zstd", "compression_level": 19 if packed else 3}
+    options["write_page_checksum"] = True
     if coded:
         options |= {"use_dictionary": False, "column_encoding": coded}
     with write_file(path) as temporary:
         pq.write_table(table, temporary, **options)
+
+
+def _header_digest(table: pa.Table) -> str:
+    """SHA-256 of what the checksums of pages leave out: sizes, names, types and metadata."""
+    fields = [[f.name, str(f.type), sorted(_texts(f.metadata).items())] for f in table.schema]
+    schema = {k: v for k, v in _texts(table.schema.metadata).items() if k != _HEADER}
+    text = json.dumps([table.num_rows, fields, sorted(schema.items())])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _check_header(path: Path, table: pa.Table, schema: Mapping[str, str]) -> None:
+    if _HEADER in schema:
+        whole = schema[_HEADER] == _header_digest(table)
+    else:
+        # A damaged list of metadata is passed over by the library as if there were none.
+        with path.open("rb") as stream:
+            stream.seek(-8, os.SEEK_END)
+            size = int.from_bytes(stream.read(4), "little")
+            stream.seek(-8 - size, os.SEEK_END)
+            whole = _HEADER.encode() not in stream.read(size)
+    if not whole:
+        raise DfsmError(f"{path} is damaged, its header is not as it was written: write it again")
 
 
 # -- packing ------------------------------------------------------------------------------------

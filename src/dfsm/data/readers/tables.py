@@ -16,6 +16,7 @@ import numpy as np
 from dfsm.core.files import existing_file, write_file
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import kept_columns, split_header, time_column
+from dfsm.data.readers.guard import check_run_name, guarded, unguarded
 from dfsm.data.readers.mat import read_mat
 from dfsm.data.readers.parquet import read_parquet, write_parquet
 from dfsm.data.trajectory import Channel, Trajectory
@@ -58,8 +59,9 @@ def read_table(path: str | Path) -> Trajectory:
 def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = False) -> None:
     """Write a run to a `.parquet` or `.csv` file.
 
-    Parquet keeps units, roles, quantisation steps, name, wall time and notes exactly; CSV keeps
-    names, units and all digits.
+    Parquet keeps units, roles, quantisation steps, name, wall time and notes exactly, and pages
+    have checksums; CSV keeps names, units and all digits. A name that a spreadsheet would run as
+    a formula (it begins with =, +, - or @) has an apostrophe before it in CSV.
 
     Parameters
     ----------
@@ -94,6 +96,7 @@ def write_table(trajectory: Trajectory, path: str | Path, *, packed: bool = Fals
     if suffix == ".csv":
         _write_csv(trajectory, path)
     else:
+        check_run_name(path, trajectory.name)
         write_parquet(trajectory, path, packed=packed)
 
 
@@ -128,7 +131,7 @@ def _read_csv(path: Path) -> Trajectory:
         raise DfsmError(f"{path}, line {reader.line_num}: {error}; it is no CSV table") from None
     if not rows:
         raise DfsmError(f"{path} holds blank lines only: check that it is the right file")
-    channels = [Channel(*split_header(cell)) for cell in rows[0]]
+    channels = [Channel(*split_header(unguarded(cell))) for cell in rows[0]]
     time = time_column(path, channels)
     for row, number in zip(rows[1:], numbers[1:], strict=True):
         if len(row) != len(channels):
@@ -197,7 +200,7 @@ def _write_csv(trajectory: Trajectory, path: Path) -> None:
                 f"{trajectory.where}: channel '{channel.name}' in '{channel.unit}' cannot be told "
                 "apart into name and unit in a CSV header: write .parquet instead"
             )
-        header.append(plain)
+        header.append(guarded(plain))
     with write_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(header)
