@@ -91,7 +91,7 @@ _DECK = """\
 0.05000              ! SS_PCGain
 !------- WIND -------------------
 120.970              ! WE_BladeRadius
--0.05                ! WE_Gamma
+25.0                 ! WE_Gamma
 1.0                  ! WE_GearboxRatio
 312456272.00000      ! WE_Jtot
 1.225                ! WE_RhoAir

@@ -386,8 +386,8 @@ class BladedLibrary:
         changes: dict[str, float | str] = {k: 0 for k in ("LoggingLevel", "Echo")}
         for key in FILES:
             if key in self.discon and self.discon.file(key).is_file():
-                changes[key] = f"{key}.txt"
-                shutil.copyfile(self.discon.file(key), folder / changes[key])
+                name = changes[key] = f"{key}.txt"
+                shutil.copyfile(self.discon.file(key), folder / name)
         known = {key: value for key, value in changes.items() if key in self.discon}
         copy = self.discon.changed(known)
         write_discon(Discon(folder / "DISCON.IN", copy.lines), folder / "DISCON.IN")

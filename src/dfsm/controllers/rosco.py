@@ -4,7 +4,8 @@ Written from ROSCO's documentation and behaviour (version 2.10.6), and checked s
 against its library. What is implemented, by the keys of the DISCON.IN:
 
 - torque: tracking of the tip speed ratio by the estimated wind (VS_ControlMode 2), by power (3) or
-  by torque (4), kω² with PI in the regions 1.5 and 2.5 (1); constant torque or power (VS_ConstPower);
+  by torque (4), kω² with PI in the regions 1.5 and 2.5 (1); constant torque or power
+  (VS_ConstPower);
 - pitch: gain-scheduled PI (PC_GS_…), minimum pitch and peak shaving (PS_Mode), floating feedback on
   the nacelle's velocity (Fl_Mode 1, 2), limits of angle and rate, actuator (PA_Mode 1, 2);
 - both: setpoint smoothing (SS_Mode); wind estimators (WE_Mode 0, 1, 2); low-pass filters (F_LPFType
@@ -16,7 +17,7 @@ wind turbines", Wind Energ. Sci. 7, 2022.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -30,15 +31,18 @@ from dfsm.controllers.discon import Discon, read_discon
 from dfsm.controllers.rosco_blocks import (
     Coefficients,
     FilterState,
+    at_least,
+    at_most,
     filtered,
+    high_pass,
     lookup,
     low_pass,
     low_pass_2,
     notch,
-    high_pass,
     proportional_integral,
     rate_limited,
     settled,
+    within,
 )
 from dfsm.controllers.rosco_deck import Modes, Power, deck_modes, deck_parameters, deck_power
 from dfsm.controllers.signals import Signals, signals
@@ -50,8 +54,6 @@ from dfsm.errors import DfsmError, near_matches
 _DAMPING, _THIRTY_DEGREES, _RATED = 0.7, 0.524, 0.98
 # Margin of the region 2.5, and bounds of the nacelle's velocity in m/s or rad/s.
 _REGION, _FASTEST = 1.01, 100.0
-# Below this power or torque the setpoint has no slope: a root's is infinite at 0.
-_LEAST = 1e-9
 
 
 class Measured(NamedTuple):
@@ -203,7 +205,7 @@ class ROSCO(eqx.Module):
         torque, pitch = (commands[i] * factors[i] for i in range(2))
         speed = self._measured(measurements, torque).speed
         if self.as_library:
-            optimal = jnp.minimum(p["VS_RtTq"], p["VS_Rgn2K"] * speed**2)
+            optimal = at_most(p["VS_RtTq"], p["VS_Rgn2K"] * speed**2)
             torque = jnp.where(speed > _RATED * p["PC_RefSpd"], p["VS_RtTq"], optimal)
         efficient = torque * speed * p["VS_GenEff"] / 100
         x = self._measured(measurements, torque)._replace(power=efficient)
@@ -224,13 +226,13 @@ class ROSCO(eqx.Module):
                 rated = highest if m.VS_ConstPower else p["VS_RtTq"]
                 optimal = p["VS_Rgn2K"] * speed**2
                 torque = jnp.where(pitch >= p["PC_Switch"], rated, optimal)
-            torque = jnp.clip(torque, p["VS_MinTq"], jnp.minimum(p["VS_MaxTq"], highest))
+            torque = within(torque, p["VS_MinTq"], at_most(p["VS_MaxTq"], highest))
         else:
             error = self._torque_setpoint(tracked, shift) - speed
-            torque_integral = jnp.clip(torque - gains[0] * error, p["VS_MinTq"], highest)
+            torque_integral = within(torque - gains[0] * error, p["VS_MinTq"], highest)
             pitch_gain = lookup(p["PC_GS_angles"], p["PC_GS_KP"], pitch)
-            error = p["PC_RefSpd"] + jnp.maximum(-shift, 0.0) - speed
-            pitch_integral = jnp.clip(pitch - pitch_gain * error, least, p["PC_MaxPit"])
+            error = p["PC_RefSpd"] + at_least(-shift, 0.0) - speed
+            pitch_integral = within(pitch - pitch_gain * error, least, p["PC_MaxPit"])
         return RoscoState(
             filters=filters,
             estimator=estimator,
@@ -276,19 +278,17 @@ class ROSCO(eqx.Module):
         if m.VS_ControlMode > 1:
             reference, tracked = filtered(self._reference_filter, filters.reference, tracked)
             filters = filters._replace(reference=reference)
-        pitch_error = p["PC_RefSpd"] + jnp.maximum(-state.shift, 0.0) - f.speed
+        pitch_error = p["PC_RefSpd"] + at_least(-state.shift, 0.0) - f.speed
         torque_error = self._torque_setpoint(tracked, state.shift) - f.speed
         shift = state.shift
         if m.SS_Mode:
             value = self._shift(state.pitch, state.pitch_least, state.power)
-            smoothing, shift = filtered(
-                low_pass(p["F_SSCornerFreq"], dt), filters.smoothing, value
-            )
+            smoothing, shift = filtered(low_pass(p["F_SSCornerFreq"], dt), filters.smoothing, value)
             filters = filters._replace(smoothing=smoothing)
         state = state._replace(filters=filters, estimator=estimator, shift=shift, power=x.power)
         state = self._with_torque(state, torque_error, f)
         state = self._with_pitch(state, pitch_error, f)
-        command = jnp.stack([jnp.maximum(state.torque, 0.0), state.pitch])
+        command = jnp.stack([at_least(state.torque, 0.0), state.pitch])
         return state, command / jnp.asarray(self._outputs.factors)
 
     def _with_torque(self, state: RoscoState, error: jax.Array, f: Filtered) -> RoscoState:
@@ -301,13 +301,13 @@ class ROSCO(eqx.Module):
             )
             state = state._replace(torque_integral=integral)
         else:
-            state, torque = self._region_torque(state, error, f, highest)
-        torque = jnp.clip(torque, p["VS_MinTq"], jnp.minimum(p["VS_MaxTq"], highest))
+            state, torque = self._region_torque(state, error, f)
+        torque = within(torque, p["VS_MinTq"], at_most(p["VS_MaxTq"], highest))
         rates = (-p["VS_MaxRat"], p["VS_MaxRat"])
         return state._replace(torque=rate_limited(torque, state.torque, rates, dt))
 
     def _region_torque(
-        self, state: RoscoState, error: jax.Array, f: Filtered, highest: jax.Array
+        self, state: RoscoState, error: jax.Array, f: Filtered
     ) -> tuple[RoscoState, jax.Array]:
         """kω² in region 2, PI below and above it; the region follows from the last step."""
         p, m, dt = self.parameters, self.modes, self.interval
@@ -330,26 +330,25 @@ class ROSCO(eqx.Module):
 
     def _with_pitch(self, state: RoscoState, error: jax.Array, f: Filtered) -> RoscoState:
         p, m, dt = self.parameters, self.modes, self.interval
-        gains = tuple(
-            lookup(p["PC_GS_angles"], p[key], f.pitch) for key in ("PC_GS_KP", "PC_GS_KI")
-        )
+        angles = p["PC_GS_angles"]
+        gains = (lookup(angles, p["PC_GS_KP"], f.pitch), lookup(angles, p["PC_GS_KI"], f.pitch))
         limits = (state.pitch_least, p["PC_MaxPit"])
         integral, pitch = proportional_integral(error, state.pitch_integral, gains, limits, dt)
         least = self._least_pitch(f.wind)
         velocity = state.velocity
         if m.Fl_Mode:
-            velocity = jnp.clip(velocity + dt * f.acceleration, -_FASTEST, _FASTEST)
+            velocity = within(velocity + dt * f.acceleration, -_FASTEST, _FASTEST)
             pitch = pitch - velocity * lookup(p["Fl_U"], p["Fl_Kp"], f.wind)
         rates = (p["PC_MinRat"], p["PC_MaxRat"])
-        pitch = jnp.clip(pitch, least, p["PC_MaxPit"])
+        pitch = within(pitch, least, p["PC_MaxPit"])
         limited = rate_limited(pitch, state.pitch_limited, rates, dt)
         # The minimum may have risen faster than the rate allows: a second limit, per blade.
-        pitch = jnp.clip(limited, least, p["PC_MaxPit"])
+        pitch = within(limited, least, p["PC_MaxPit"])
         sent = rate_limited(pitch, state.pitch_sent, rates, dt)
         actuator, pitch = state.filters.actuator, sent
         if m.PA_Mode:
             actuator, pitch = filtered(self._actuator, actuator, sent)
-        pitch = jnp.clip(pitch, p["PC_MinPit"], p["PC_MaxPit"])
+        pitch = within(pitch, p["PC_MinPit"], p["PC_MaxPit"])
         return state._replace(
             filters=state.filters._replace(actuator=actuator),
             pitch=rate_limited(pitch, state.pitch, rates, dt),
@@ -362,28 +361,25 @@ class ROSCO(eqx.Module):
 
     # -- setpoints and limits ---------------------------------------------------------------------
 
-    def _tracked_speed(
-        self, wind: jax.Array, power: jax.Array, torque: jax.Array
-    ) -> jax.Array:
+    def _tracked_speed(self, wind: jax.Array, power: jax.Array, torque: jax.Array) -> jax.Array:
         """Speed of the generator that tracks the best tip speed ratio."""
         p, mode = self.parameters, self.modes.VS_ControlMode
         if mode == 2:
             return p["VS_TSRopt"] * wind / p["WE_BladeRadius"] * p["WE_GearboxRatio"]
         if mode == 3:
             shaft = power / (p["VS_GenEff"] / 100) / p["VS_Rgn2K"]
-            return jnp.cbrt(jnp.maximum(shaft, _LEAST))
+            return _root(jnp.cbrt, shaft)
         if mode == 4:
-            return jnp.sqrt(jnp.maximum(torque / p["VS_Rgn2K"], _LEAST))
+            return _root(jnp.sqrt, torque / p["VS_Rgn2K"])
         return p["VS_RefSpd"] + 0.0 * wind
 
     def _torque_setpoint(self, tracked: jax.Array, shift: jax.Array) -> jax.Array:
         p = self.parameters
-        speed = jnp.clip(tracked, p["VS_MinOMSpd"], p["VS_RefSpd"])
-        return jnp.maximum(speed - jnp.maximum(shift, 0.0), p["VS_MinOMSpd"])
+        speed = within(tracked, p["VS_MinOMSpd"], p["VS_RefSpd"])
+        return at_least(speed - at_least(shift, 0.0), p["VS_MinOMSpd"])
 
     def _shift(self, pitch: jax.Array, least: jax.Array, power: jax.Array) -> jax.Array:
-        """Setpoint smoothing: pitch above its minimum slows the torque's setpoint, power that
-        lacks raises the pitch's."""
+        """Setpoint smoothing: less torque above the minimum pitch, less pitch below rated power."""
         p = self.parameters
         above = (pitch - least) / _THIRTY_DEGREES * p["SS_VSGain"]
         lacking = (p["VS_RtPwr"] - power) / p["VS_RtPwr"] * p["SS_PCGain"]
@@ -396,14 +392,14 @@ class ROSCO(eqx.Module):
     def _highest_torque(self, speed: jax.Array) -> jax.Array:
         p = self.parameters
         if self.modes.VS_ConstPower:
-            return jnp.minimum(self._constant_power(speed), p["VS_MaxTq"])
+            return at_most(self._constant_power(speed), p["VS_MaxTq"])
         return p["VS_RtTq"]
 
     def _least_pitch(self, wind: jax.Array) -> jax.Array:
         p = self.parameters
         if not self.modes.PS_Mode:
             return p["PC_FinePit"] + 0.0 * wind
-        return jnp.maximum(lookup(p["PS_WindSpeeds"], p["PS_BldPitchMin"], wind), p["PC_FinePit"])
+        return at_least(lookup(p["PS_WindSpeeds"], p["PS_BldPitchMin"], wind), p["PC_FinePit"])
 
     # -- measurements and filters -----------------------------------------------------------------
 
@@ -488,8 +484,8 @@ class ROSCO(eqx.Module):
 
     def _notch(self, i: int) -> Coefficients:
         p = self.parameters
-        keys = ("F_NotchFreqs", "F_NotchBetaNum", "F_NotchBetaDen")
-        return notch(*(p[key][i] for key in keys), self.interval)
+        dampings = p["F_NotchBetaNum"][i], p["F_NotchBetaDen"][i]
+        return notch(p["F_NotchFreqs"][i], *dampings, self.interval)
 
     @property
     def _wind_filter(self) -> Coefficients:
@@ -517,6 +513,12 @@ class ROSCO(eqx.Module):
 
 
 _FEEDBACK = {1: "nacelle_acceleration", 2: "nacelle_pitch_acceleration"}
+
+
+def _root(root: Callable[[jax.Array], jax.Array], value: jax.Array) -> jax.Array:
+    """Root of what is positive, else 0; there its slope is 0, not infinite."""
+    positive = value > 0
+    return jnp.where(positive, root(jnp.where(positive, value, 1.0)), 0.0)
 
 
 def _chained(

@@ -42,7 +42,7 @@ def low_pass_2(corner: jax.Array, damping: jax.Array, interval: float) -> Coeffi
 
 
 def high_pass(corner: jax.Array, interval: float) -> Coefficients:
-    """s / (s + ω)."""
+    """S / (s + ω)."""
     rate = 2 / interval
     gain = rate / (corner + rate)
     return Coefficients((gain, -gain), ((corner - rate) / (corner + rate),))
@@ -84,6 +84,25 @@ def settled(coefficients: Coefficients, value: jax.Array, out: jax.Array) -> Fil
     return tuple(state)
 
 
+def at_least(value: jax.Array, lowest: jax.Array | float) -> jax.Array:
+    """The larger of both, with the slope of one of them.
+
+    `jnp.maximum` has the slope of whatever equals its result. Compilers round the same number in
+    two ways, within a multiply-add and alone, and where nothing equals the result it has none.
+    """
+    return jnp.where(value < lowest, lowest, value)
+
+
+def at_most(value: jax.Array, highest: jax.Array | float) -> jax.Array:
+    """The smaller of both, as `at_least`."""
+    return jnp.where(value > highest, highest, value)
+
+
+def within(value: jax.Array, lowest: jax.Array | float, highest: jax.Array | float) -> jax.Array:
+    """The value between both limits, the higher one before the lower, as `at_least`."""
+    return at_most(at_least(value, lowest), highest)
+
+
 def rate_limited(
     value: jax.Array, last: jax.Array, limits: tuple[jax.Array, jax.Array], interval: float
 ) -> jax.Array:
@@ -92,7 +111,7 @@ def rate_limited(
     Within them it is `value` to the last digit: a pitch that rounding takes below its minimum
     would switch the wind estimator off.
     """
-    return jnp.clip(value, last + limits[0] * interval, last + limits[1] * interval)
+    return within(value, last + limits[0] * interval, last + limits[1] * interval)
 
 
 def proportional_integral(
@@ -104,8 +123,8 @@ def proportional_integral(
 ) -> tuple[jax.Array, jax.Array]:
     """Next integral and output, both within `limits`; at a limit the integral waits there."""
     proportional, integrating = gains
-    integral = jnp.clip(integral + interval * integrating * error, *limits)
-    return integral, jnp.clip(proportional * error + integral, *limits)
+    integral = within(integral + interval * integrating * error, *limits)
+    return integral, within(proportional * error + integral, *limits)
 
 
 def lookup(points: jax.Array, values: jax.Array, at: jax.Array) -> jax.Array:
@@ -126,4 +145,4 @@ def lookup_2(
 def _place(points: jax.Array, at: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Interval of `at`, and where in it, 0 to 1."""
     i = jnp.clip(jnp.sum(points <= at) - 1, 0, len(points) - 2)
-    return i, jnp.clip((at - points[i]) / (points[i + 1] - points[i]), 0.0, 1.0)
+    return i, within((at - points[i]) / (points[i + 1] - points[i]), 0.0, 1.0)

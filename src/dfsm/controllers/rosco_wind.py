@@ -8,7 +8,7 @@ wind turbines", Wind Energ. Sci. 7, 2022; R. Ortega and others, "On line estimat
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 
 from dfsm.controllers.rosco_blocks import (
     FilterState,
+    at_least,
     filtered,
     lookup,
     lookup_2,
@@ -60,7 +61,7 @@ class Estimator(NamedTuple):
     wind: jax.Array
     working: jax.Array
     hub: FilterState
-    inner: Kalman | jax.Array | None
+    inner: Any
 
 
 class Seen(NamedTuple):
@@ -73,7 +74,9 @@ class Seen(NamedTuple):
     wind: jax.Array
 
 
-def started(mode: int, p: Parameters, seen: Seen, power: Power | None, interval: float) -> Estimator:
+def started(
+    mode: int, p: Parameters, seen: Seen, power: Power | None, interval: float
+) -> Estimator:
     """State after ROSCO's start call."""
     hub = low_pass(p["F_WECornerFreq"] / 10, interval)
     inner = None
@@ -141,7 +144,7 @@ def _immersed(
     """Next integral and estimate of immersion and invariance."""
     air = 0.5 * p["WE_RhoAir"] * np.pi * p["WE_BladeRadius"] ** 2
     cp = _coefficient(p, power, seen, wind)
-    driving = jnp.maximum(air * wind**3 / seen.speed * cp, 0.0)
+    driving = at_least(air * wind**3 / seen.speed * cp, 0.0)
     rate = p["WE_Gamma"] / p["WE_Jtot"] * (seen.torque * p["WE_GearboxRatio"] - driving)
     integral = integral + rate * interval
     return integral, integral + p["WE_Gamma"] * seen.speed
@@ -150,7 +153,7 @@ def _immersed(
 def _kalman_started(seen: Seen, wind: jax.Array) -> Kalman:
     zero, small = jnp.zeros_like(wind), jnp.full_like(wind, 0.01)
     covariance = (small, zero, zero, small, zero, jnp.ones_like(wind))
-    return Kalman(seen.speed, zero, jnp.maximum(wind, _LEAST_WIND), (zero,) * 3, covariance)
+    return Kalman(seen.speed, zero, at_least(wind, _LEAST_WIND), (zero, zero, zero), covariance)
 
 
 def _kalman_moved(
@@ -161,15 +164,17 @@ def _kalman_moved(
     As in ROSCO, the correction compares the measured speed with the estimate before the
     prediction, and the covariance is predicted with the last correction's gain.
     """
-    last: Kalman = state.inner  # pyright: ignore[reportAssignmentType]
+    last: Kalman = state.inner
     wind = last.mean + last.turbulent
     length = 6 * p["WE_BladeRadius"]
     inertia = p["WE_Jtot"]
     air = 0.5 * p["WE_RhoAir"] * np.pi * p["WE_BladeRadius"] ** 2
-    cp = jnp.maximum(_coefficient(p, power, seen, wind), 0.0)
+    cp = at_least(_coefficient(p, power, seen, wind), 0.0)
     # Jacobian of (speed, turbulent, mean).
     pole = lookup(p["WE_FOPoles_v"], p["WE_FOPoles"], wind)
-    push = air * 3 * cp * wind**2 / (inertia * last.speed)
+    # The speed itself may become negative, what is divided by and compared with it may not.
+    turning = at_least(last.speed, np.finfo(float).eps)
+    push = air * 3 * cp * wind**2 / (inertia * turning)
     decay, shift = -np.pi * last.mean / (2 * length), -np.pi * last.turbulent / (2 * length)
     p11, p12, p13, p22, p23, p33 = last.covariance
     f11 = pole * p11 + push * (p12 + p13)
@@ -184,20 +189,23 @@ def _kalman_moved(
     p22 = p22 + interval * (2 * f22 + swing - _NOISE * k2 * k2)
     p23 = p23 + interval * (f23 - _NOISE * k2 * k3)
     p33 = p33 + interval * (_DRIFT - _NOISE * k3 * k3)
-    driving = jnp.maximum(air * wind**3 / seen.speed * cp, 0.0)
+    driving = at_least(air * wind**3 / seen.speed * cp, 0.0)
     braking = p["WE_GearboxRatio"] * seen.torque_filtered
     speed = last.speed + interval * (driving - braking) / inertia
     turbulent = last.turbulent + interval * decay * last.turbulent
     k1, k2, k3 = (c / (p11 + _NOISE) for c in (p11, p12, p13))
-    missed = seen.speed - last.speed
+    missed = seen.speed - turning
     covariance = (
         *(p11 - k1 * p11, p12 - k1 * p12, p13 - k1 * p13),
         *(p22 - k2 * p12, p23 - k2 * p13, p33 - k3 * p13),
     )
+    speed, turbulent, mean = speed + k1 * missed, turbulent + k2 * missed, last.mean + k3 * missed
+    # An estimate that is lost is the measured wind from then on.
+    lost = jnp.isnan(turbulent + mean)
     return Kalman(
-        jnp.maximum(speed + k1 * missed, np.finfo(float).eps),
-        turbulent + k2 * missed,
-        last.mean + k3 * missed,
+        jnp.where(lost, seen.speed, speed),
+        jnp.where(lost, 0.0, turbulent),
+        jnp.where(lost, seen.wind, mean),
         (k1, k2, k3),
         covariance,
     )
