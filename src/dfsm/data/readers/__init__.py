@@ -39,7 +39,7 @@ __all__ = [
     "write_table",
 ]
 
-OPENFAST = {".outb", ".out"}
+OPENFAST = {".outb", ".out", ".dbg", ".dbg2", ".dbg3"}
 TABLES = {".csv", ".txt", ".tsv", ".parquet", ".pq", ".mat"}
 # How files begin that are recognised under any name.
 SIGNATURES = {b"PAR1": read_table, b"MATLAB": read_table, b"\x89HDF": read_table} | {
@@ -47,14 +47,16 @@ SIGNATURES = {b"PAR1": read_table, b"MATLAB": read_table, b"\x89HDF": read_table
 }
 
 
-def read(path: str | Path) -> Trajectory:
+def read(path: str | Path, step: float | None = None) -> Trajectory:
     """Read one run, whatever kind of file it is.
 
     Parameters
     ----------
     path
-        OpenFAST `.outb` or `.out`, `.csv` (`.txt`, `.tsv`), `.parquet` or `.mat`; under another
-        name, binary files are recognised by their first bytes.
+        OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, `.csv` (`.txt`, `.tsv`), `.parquet` or `.mat`;
+        under another name, binary files are recognised by their first bytes.
+    step
+        Interval between samples in s for tables that hold no time.
 
     Returns
     -------
@@ -71,19 +73,21 @@ def read(path: str | Path) -> Trajectory:
     if suffix in OPENFAST:
         return read_openfast(path)
     if suffix in TABLES:
-        return read_table(path)
+        return read_table(path, step)
     with path.open("rb") as stream:
         start = stream.read(8)
     for signature, reader in SIGNATURES.items():
         if start.startswith(signature):
-            return reader(path)
+            return read_table(path, step) if reader is read_table else reader(path)
     raise DfsmError(
         f"{path}: '{path.suffix}' is no known kind of file; expected .outb, .out, .csv, .parquet "
         "or .mat: rename or convert it"
     )
 
 
-def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[Trajectory]:
+def read_all(
+    patterns: Iterable[str | Path], base: Path | None = None, step: float | None = None
+) -> list[Trajectory]:
     """Read every file that the patterns name, each once, in the order named.
 
     Parameters
@@ -92,6 +96,8 @@ def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[T
         File names or glob patterns (``runs/*.outb``, ``**`` for any depth); one alone will do.
     base
         Folder that relative patterns start from; default the working folder.
+    step
+        Interval between samples in s for tables that hold no time.
 
     Returns
     -------
@@ -109,7 +115,7 @@ def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[T
     for pattern in patterns:
         for path in _expand(pattern, base):
             paths.setdefault(path.resolve(), path)
-    return [read(path) for path in track(list(paths.values()), "Reading runs")]
+    return [read(path, step) for path in track(list(paths.values()), "Reading runs")]
 
 
 def with_wall_times(runs: Iterable[Trajectory], path: str | Path) -> list[Trajectory]:
