@@ -137,6 +137,7 @@ def uniform_times(path: Path, count: int, step: float) -> Array:
     """
     if not (np.isfinite(step) and step > 0):
         raise DfsmError(
-            f"{path}: the interval between samples is {step:g} s, expected a positive number"
+            f"{path}: the interval between samples is {step:g} s, expected a positive number: "
+            "correct it"
         )
     return step * np.arange(count)

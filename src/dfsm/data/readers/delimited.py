@@ -1,9 +1,9 @@
 """Tables in text: CSV, and columns separated by semicolons, tabs or blanks.
 
-The header is the first line that names a time; lines above it may say anything, and lines that begin
-with ``#``, ``%`` or ``!`` are comments (NumPy's ``savetxt`` writes the header as one). Units stand in
-the header as ``PtfmPitch [deg]``, or in a row of their own below it. Without a time there may be a
-column or a comment that tells the rate: ``fs = 50``, ``Ts``, ``dt``.
+The header is the first line that names a time; lines above it may say anything, and lines that
+begin with ``#``, ``%`` or ``!`` are comments (NumPy's ``savetxt`` writes the header as one). Units
+stand in the header as ``PtfmPitch [deg]``, or in a row of their own below it. Without a time there
+may be a column or a comment that tells the rate: ``fs = 50``, ``Ts``, ``dt``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """MAT files: structs of any depth, matrices, Simulink's output, and what `ReadFASTbinary` leaves.
 
-Names are those of the workspace: ``body.position`` of 6 columns becomes ``body.position_1`` to ``_6``;
-arrays of structs count their elements (``bodies_1.position``). Simulink's *Structure With Time* is
-``time`` and ``signals.values``. A variable that holds one struct and nothing beside it names nothing.
+Names are those of the workspace: ``body.position`` of 6 columns becomes ``body.position_1`` to
+``_6``; arrays of structs count their elements (``bodies_1.position``). Simulink's *Structure With
+Time* is ``time`` and ``signals.values``. One struct with nothing beside it names nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dfsm.data.readers.columns import (
     uniform_times,
 )
 from dfsm.data.readers.hdf5 import read_hdf5
-from dfsm.data.readers.mat5 import OTHER, Damaged, read_mat5
+from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -40,7 +40,7 @@ def read_mat(path: Path, step: float | None = None) -> Trajectory:
     Raises
     ------
     DfsmError
-        Damaged, v7.3 (HDF5) without h5py, or without time and channels.
+        DamagedError, v7.3 (HDF5) without h5py, or without time and channels.
     """
     with path.open("rb") as stream:
         start = stream.read(520)
@@ -49,7 +49,7 @@ def read_mat(path: Path, step: float | None = None) -> Trajectory:
     else:
         try:
             content = read_mat5(path)
-        except Damaged as error:
+        except DamagedError as error:
             raise DfsmError(
                 f"{path} is no readable MAT file ({error}): save it again with -v7"
             ) from None

@@ -54,7 +54,7 @@ _DEEPEST, _MOST_DIMENSIONS = 32, 32
 OTHER = "an array of another class"
 
 
-class Damaged(ValueError):
+class DamagedError(ValueError):
     """What is wrong with a file, as the tail of a sentence."""
 
 
@@ -70,20 +70,20 @@ def read_mat5(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    Damaged
+    DamagedError
         The bytes make no such file.
     """
     raw = path.read_bytes()
     mark = raw[126:128]
     if len(raw) < _HEADER or mark not in (b"IM", b"MI"):
-        raise Damaged("its header is not that of a MAT file")
+        raise DamagedError("its header is not that of a MAT file")
     order = "<" if mark == b"IM" else ">"
     content = {}
     for kind, data in _elements(raw[_HEADER:], order):
         if kind == _COMPRESSED:
             kind, data = next(_elements(_inflated(data), order), (0, b""))
         if kind != _MATRIX:
-            raise Damaged(f"an element of type {kind} stands where an array is expected")
+            raise DamagedError(f"an element of type {kind} stands where an array is expected")
         name, value = _array(data, order, 0)
         if name:
             content[name] = value
@@ -94,7 +94,7 @@ def _inflated(data: bytes) -> bytes:
     try:
         return zlib.decompress(data)
     except (zlib.error, MemoryError) as error:
-        raise Damaged(f"a compressed element cannot be unpacked ({error})") from None
+        raise DamagedError(f"a compressed element cannot be unpacked ({error})") from None
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -102,19 +102,19 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
     at = 0
     while at < len(data):
         if at + 8 > len(data):
-            raise Damaged("it ends inside a tag")
+            raise DamagedError("it ends inside a tag")
         (word,) = struct.unpack_from(f"{order}I", data, at)
         small = word >> 16
         if small:
             kind, size, start, following = word & 0xFFFF, small, at + 4, at + 8
             if size > 4:
-                raise Damaged(f"a short element announces {size} bytes")
+                raise DamagedError(f"a short element announces {size} bytes")
         else:
             kind, (size,), start = word, struct.unpack_from(f"{order}I", data, at + 4), at + 8
             # Compressed elements alone are not padded.
             following = start + size + (0 if kind == _COMPRESSED else -size % 8)
         if start + size > len(data):
-            raise Damaged(f"an element announces {size} bytes, {len(data) - start} are there")
+            raise DamagedError(f"an element announces {size} bytes, {len(data) - start} are there")
         yield kind, data[start : start + size]
         at = following
 
@@ -122,12 +122,12 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 def _array(data: bytes, order: str, depth: int) -> tuple[str, Any]:
     """Name and value of an array."""
     if depth > _DEEPEST:
-        raise Damaged(f"its arrays are nested more than {_DEEPEST} deep")
+        raise DamagedError(f"its arrays are nested more than {_DEEPEST} deep")
     if not data:  # an empty cell
         return "", np.empty((0, 0))
     parts = list(_elements(data, order))
     if len(parts) < 3 or len(parts[0][1]) < 8:
-        raise Damaged("an array has no flags, dimensions and name")
+        raise DamagedError("an array has no flags, dimensions and name")
     flags = struct.unpack_from(f"{order}I", parts[0][1])[0]
     kind = flags & 0xFF
     if kind not in (_CELL, _STRUCT, _CHAR, *_NUMERIC):
@@ -150,17 +150,17 @@ def _array(data: bytes, order: str, depth: int) -> tuple[str, Any]:
 
 def _so_many(parts: list[tuple[int, bytes]], count: int) -> list[tuple[int, bytes]]:
     if len(parts) < count:
-        raise Damaged(f"an array has {len(parts)} parts, its dimensions ask for {count}")
+        raise DamagedError(f"an array has {len(parts)} parts, its dimensions ask for {count}")
     return parts[:count]
 
 
 def _shape(part: tuple[int, bytes], order: str) -> tuple[int, ...]:
     kind, data = part
     if kind != _INT32 or len(data) % 4 or not 2 <= len(data) // 4 <= _MOST_DIMENSIONS:
-        raise Damaged("the dimensions of an array make no sense")
+        raise DamagedError("the dimensions of an array make no sense")
     shape = struct.unpack(f"{order}{len(data) // 4}i", data)
     if min(shape) < 0:
-        raise Damaged(f"an array has the dimensions {' x '.join(map(str, shape))}")
+        raise DamagedError(f"an array has the dimensions {' x '.join(map(str, shape))}")
     return shape
 
 
@@ -168,10 +168,10 @@ def _numbers(part: tuple[int, bytes], order: str, count: int) -> np.ndarray:
     """As many numbers, stored in whatever type takes least room, in double precision."""
     kind, data = part
     if kind not in _NUMBERS:
-        raise Damaged(f"numbers of type {kind} are not known")
+        raise DamagedError(f"numbers of type {kind} are not known")
     values = np.frombuffer(data, f"{order}{_NUMBERS[kind]}", len(data) // int(_NUMBERS[kind][1]))
     if len(values) != count:
-        raise Damaged(f"an array holds {len(values)} numbers, its dimensions make {count}")
+        raise DamagedError(f"an array holds {len(values)} numbers, its dimensions make {count}")
     return values.astype(np.float64)
 
 
@@ -189,7 +189,7 @@ def _text(kind: int, data: bytes, order: str) -> str:
     elif kind in _TEXTS:
         encoding = _TEXTS[kind]
     else:
-        raise Damaged(f"a text of type {kind} is not known")
+        raise DamagedError(f"a text of type {kind} is not known")
     return data.decode(encoding, errors="replace")
 
 
@@ -197,7 +197,7 @@ def _struct(parts: list[tuple[int, bytes]], count: int, order: str, depth: int) 
     (_, width), (_, names) = _so_many(parts, 2)
     length = struct.unpack(f"{order}i", width)[0] if len(width) == 4 else 0
     if length <= 0 or len(names) % length:
-        raise Damaged("the field names of a struct make no sense")
+        raise DamagedError("the field names of a struct make no sense")
     fields = [
         names[i : i + length].split(b"\0")[0].decode("latin-1")
         for i in range(0, len(names), length)

@@ -1,4 +1,6 @@
-"""OpenFAST results: binary `.outb` (formats 1 to 4), text `.out`, binary under the name `.out`; ROSCO's log.
+"""OpenFAST results: binary `.outb` (formats 1 to 4), text `.out`, one under the other's name.
+
+ROSCO's own logs are such text, too: a title, names, units.
 
 openfast-io decodes the samples but validates nothing, so a file is checked against its own header
 before that library sees it. Layout of the binary formats: `ReadFASTbinary.m` of NREL's
@@ -29,7 +31,7 @@ DEFAULT_NAME_WIDTH = 10
 # OpenFAST uses 10 or 20 characters; anything far above is a corrupted header, not a name.
 MAX_NAME_WIDTH = 1024
 HEADER_LINES = 200
-# ROSCO's own logs (.dbg, .dbg2, .dbg3 by LoggingLevel; `Debug` in ROSCO_IO.f90): a title, names, units.
+# ROSCO's own logs: .dbg, .dbg2, .dbg3 by LoggingLevel (`Debug` in ROSCO_IO.f90).
 ROSCO_LOG = ".dbg"
 # A unit in brackets, blanks and all, or a word.
 BRACKETED = re.compile(r"\([^()]*\)|\[[^\[\]]*\]|\S+")
@@ -151,8 +153,8 @@ def _check_header(path: Path) -> _Header:
         expected = stream.tell() + samples * row
     if size < expected:
         raise DfsmError(
-            f"{path} is truncated: its header announces {count} channels and {samples} samples, which "
-            f"makes {expected} bytes, but it has {size}; copy it again or rerun the simulation"
+            f"{path} is truncated: its header announces {count} channels and {samples} samples, "
+            f"which makes {expected} bytes, but it has {size}; copy it again or rerun the simulation"
         )
     return _Header(names[1:], tuple(map(_unit, units[1:])), scales, size - expected)
 
@@ -258,26 +260,26 @@ def _text_header(path: Path, lines: list[str]) -> tuple[int, list[str], list[str
 
     Drivers write headers of other lengths than OpenFAST, so the line is looked for.
     """
-    for number, text in enumerate(lines[:HEADER_LINES], start=1):
+    for line, text in enumerate(lines[:HEADER_LINES], start=1):
         names = text.split()
         if len(names) < 2 or names[0].lower() != "time":
             continue
-        below = lines[number] if number < len(lines) else ""
+        below = lines[line] if line < len(lines) else ""
         first = below.split()[:1]
         if first and (_is_number(first[0])):
-            return number, names, None
+            return line, names, None
         # Between tabs a unit may hold blanks or be empty; so may one in brackets hold blanks.
         named, tabbed = _tabbed(text), _tabbed(below)
         if len(named) > 1 and len(named) == len(tabbed):
-            return number, named, tabbed
+            return line, named, tabbed
         for units in (below.split(), BRACKETED.findall(below)):
             if len(units) == len(names):
-                return number, names, units
+                return line, names, units
         # A title may begin with the word as well, but is not followed by units.
         if first and first[0].startswith(("(", "[")):
             raise DfsmError(
-                f"{path}, line {number + 1}: {len(below.split())} units for the {len(names)} names "
-                f"in line {number}, one unit per name was expected: the file is cut off or foreign"
+                f"{path}, line {line + 1}: {len(below.split())} units for the {len(names)} names "
+                f"in line {line}, one unit per name was expected: the file is cut off or foreign"
             )
     raise DfsmError(
         f"{path} is no OpenFAST output: no line that starts with 'Time' among its first "

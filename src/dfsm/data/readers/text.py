@@ -100,7 +100,7 @@ class Layout:
 
 
 def decode(path: Path, expected: str) -> str:
-    """Text of a file in whatever encoding it has, with ``\\n`` at the ends of its lines.
+    """Text of a file in whatever encoding it has, with line feeds at the ends of its lines.
 
     Raises
     ------
@@ -196,7 +196,11 @@ def _cell_by_cell(rows: list[Row], layout: Layout) -> tuple[Array, list[int], St
             stamps = read_stamps(layout.path, layout.names[j], cells)
             values[:, j] = stamps.seconds
             continue
-        found = [number(cell) for cell in cells]
+        try:
+            values[:, j] = np.array(cells, dtype=np.float64)
+            continue
+        except ValueError:
+            found = [number(cell) for cell in cells]
         if j != layout.time and all(f is None for f in found):
             words.append(j)
             continue
