@@ -66,8 +66,9 @@ def _equal_rows(values: Array) -> int:
 def _changes(values: Array) -> tuple[Array, Array, Array]:
     """Of channels that vary: the first change, the usual one, and that in the rows beside (RMS)."""
     changes = np.diff(values[:, np.isfinite(values).all(axis=0)], axis=0)
-    usual = np.sqrt(np.mean(changes[1:] ** 2, axis=0))
-    beside = np.sqrt(np.mean(changes[1 : 1 + _BESIDE] ** 2, axis=0))
+    with np.errstate(over="ignore"):  # infinite is large enough to compare with
+        usual = np.sqrt(np.mean(changes[1:] ** 2, axis=0))
+        beside = np.sqrt(np.mean(changes[1 : 1 + _BESIDE] ** 2, axis=0))
     varies = usual > 0
     return np.abs(changes[0, varies]), usual[varies], beside[varies]
 

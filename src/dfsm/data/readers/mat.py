@@ -2,7 +2,7 @@
 
 Names are those of the workspace: ``body.position`` of 6 columns becomes ``body.position_1`` to
 ``_6``; arrays of structs count their elements (``bodies_1.position``). Simulink's *Structure With
-Time* is ``time`` and ``signals.values``. One struct with nothing beside it names nothing.
+Time* is ``time`` and ``signals.values``. A struct that is the only one names nothing.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from dfsm.data.readers.columns import (
     uniform_times,
 )
 from dfsm.data.readers.hdf5 import read_hdf5
+from dfsm.data.readers.mat4 import is_mat4, read_mat4
 from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -48,25 +49,23 @@ def read_mat(path: Path, step: float | None = None) -> Trajectory:
         content = {k: v for k, v in read_hdf5(path).items() if not k.startswith("@")}
     else:
         try:
-            content = read_mat5(path)
+            content = read_mat4(path) if is_mat4(start) else read_mat5(path)
         except DamagedError as error:
             raise DfsmError(
                 f"{path} is no readable MAT file ({error}): save it again with -v7"
             ) from None
-    if len(content) == 1 and isinstance(inside := next(iter(content.values())), Mapping):
-        content = dict(inside)
-    elif "Channels" not in content and len(s := [v for v in content.values() if _is_run(v)]) == 1:
-        content = dict(s[0]) if not _is_run(content) else content
+    structs = {n: v for n, v in content.items() if isinstance(v, Mapping)}
+    if not _is_run(content) and len(structs) == 1:
+        ((outer, inside),) = structs.items()
+        content = {**inside, **{n: v for n, v in content.items() if n not in (outer, *inside)}}
     if "Channels" in content:
         return _from_channels(path, content)
     return _from_variables(path, content, step)
 
 
-def _is_run(value: Any) -> bool:
-    """Whether a struct holds a time or `Channels`."""
-    return isinstance(value, Mapping) and (
-        "Channels" in value or any(k.lower() in MAT_TIME_NAMES for k in value)
-    )
+def _is_run(content: Mapping[str, Any]) -> bool:
+    """Whether variables hold a time or `Channels`."""
+    return "Channels" in content or any(n.lower() in MAT_TIME_NAMES for n in content)
 
 
 def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:

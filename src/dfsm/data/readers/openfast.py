@@ -154,7 +154,8 @@ def _check_header(path: Path) -> _Header:
     if size < expected:
         raise DfsmError(
             f"{path} is truncated: its header announces {count} channels and {samples} samples, "
-            f"which makes {expected} bytes, but it has {size}; copy it again or rerun the simulation"
+            f"which makes {expected} bytes, but it has {size}; copy it again or rerun the "
+            "simulation"
         )
     return _Header(names[1:], tuple(map(_unit, units[1:])), scales, size - expected)
 
