@@ -18,7 +18,19 @@ import typer
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
-from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
+from dfsm.cli.terminal import (
+    AsJson,
+    Files,
+    Quiet,
+    SampleStep,
+    as_in_fit,
+    fit_start,
+    lines,
+    print_json,
+    say,
+    tell_notes,
+    working,
+)
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
@@ -49,18 +61,25 @@ IntervalFile = Annotated[
 
 
 @app.command()
-def info(files: Files, as_json: AsJson = False) -> None:
+def info(
+    files: Files,
+    each: Annotated[bool, typer.Option("--each", help="A table for every run.")] = False,
+    step: SampleStep = None,
+    as_json: AsJson = False,
+) -> None:
     """List channels, units, ranges, sampling and quantisation, and what looks wrong."""
-    from dfsm.cli.tables import print_info
+    from dfsm.cli.tables import print_info, print_merged
     from dfsm.data.info import describe
     from dfsm.data.readers import read_all
 
     with show_progress():
-        infos = [describe(run) for run in read_all(files)]
+        infos = [describe(run) for run in read_all(files, step=step)]
     if as_json:
         print_json([i.to_dict() for i in infos])
-    else:
+    elif each or len(infos) == 1:
         print_info(infos)
+    else:
+        print_merged(infos)
 
 
 @app.command()
@@ -70,6 +89,7 @@ def init(
         "config.yaml"
     ),
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    step: SampleStep = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a commented configuration with the channels of the files."""
@@ -80,7 +100,7 @@ def init(
     if output.exists() and not force:
         raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
     with working(quiet):
-        write_config(files, output)
+        write_config(files, output, step)
     say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
 
@@ -99,6 +119,7 @@ def fit(
     check_target(output)
     with working(quiet):
         settings, runs = load_config(config)
+        tell_notes(runs, quiet)
         result = run_fit(runs, settings.fit_settings(), settings.refine)
         model = result.model
     replaced = output.exists() and any(output.iterdir())
@@ -139,8 +160,10 @@ def compare(
     check_output(output, candidates)
     files, hold_out = settings.compare.validation, settings.compare.hold_out
     with working(quiet):
-        runs = read_all(settings.data.train, config.parent)
-        validation = None if files is None else read_all(files, config.parent)
+        step = settings.data.step
+        runs = read_all(settings.data.train, config.parent, step)
+        validation = None if files is None else read_all(files, config.parent, step)
+        tell_notes([*runs, *(validation or [])], quiet)
         ranking = run_compare(
             candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
         )
@@ -203,7 +226,8 @@ def validate(
     start = fit_start(main) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     with working(quiet):
-        runs = read_all(files)
+        runs = as_in_fit(main, read_all(files))
+        tell_notes(runs, quiet)
         for path in targets:
             check_file(path, [wall_times, intervals, *(r.source for r in runs)])
         if wall_times is not None:
@@ -232,7 +256,11 @@ def simulate(
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
     method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
     step: Annotated[
-        float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
+        float | None,
+        typer.Option(
+            help="Largest RK4 step in s; default the run's samples, whose interval it tells where "
+            "the file holds no times."
+        ),
     ] = None,
     intervals: IntervalFile = None,
     quiet: Quiet = False,
@@ -259,7 +287,9 @@ def simulate(
         calibrated.check(surrogate)
     with working(quiet), hushed():  # the outcome is printed below
         signals = surrogate.signals
-        recorded = with_computed(read(run), signals.hub_height, signals.features)
+        (recorded,) = as_in_fit(surrogate, [read(run, step)])
+        tell_notes([recorded], quiet)
+        recorded = with_computed(recorded, signals.hub_height, signals.features)
         result = run_simulate(
             surrogate,
             recorded,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from dfsm.cli.terminal import Files, Quiet, fit_start, say, working
+from dfsm.cli.terminal import Files, Quiet, as_in_fit, fit_start, say, tell_notes, working
 
 
 def calibrate(
@@ -32,7 +32,8 @@ def calibrate(
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     with working(quiet):
-        runs = read_all(files)
+        runs = as_in_fit(surrogate, read_all(files))
+        tell_notes(runs, quiet)
         check_file(output, [*model.iterdir(), *(run.source for run in runs)])
         intervals = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
     intervals.save(output)

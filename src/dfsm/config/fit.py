@@ -15,6 +15,7 @@ from dfsm.core.settings import require
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
 from dfsm.data.readers import read_all
+from dfsm.data.slower import Slower
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
@@ -43,12 +44,18 @@ class DataConfig(Strict):
         Time window in s; null leaves that end open.
     hub_height
         In m; adds the corrected rotor wind ``RtVAvgxhCorr`` to every run.
+    step
+        Interval between samples in s of files that hold no time.
+    slower
+        What channels with fewer samples than their table do in between: hold or linear, or by name.
     """
 
     train: list[str]
     start: float | None = None
     stop: float | None = None
     hub_height: float | None = None
+    step: float | None = None
+    slower: Slower = None
 
 
 class SignalConfig(Strict):
@@ -124,6 +131,7 @@ class Config(Strict):
             start=self.data.start,
             stop=self.data.stop,
             hub_height=self.data.hub_height,
+            slower=self.data.slower,
             derivatives=self.derivatives,
             linear=self.linear,
             terms=tuple(self._rooted(term) for term in self.terms),
@@ -156,7 +164,7 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
         _check_together(config)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
-    return config, read_all(config.data.train, path.parent)
+    return config, read_all(config.data.train, path.parent, config.data.step)
 
 
 def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
+from dfsm.data.signs import wrapping
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.filters import Filter, filtered
@@ -249,6 +250,7 @@ class _State:
 
 def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeSettings) -> _State:
     run.select(spec.channels).require_finite()
+    _refuse_wrap(run, spec.name)
     chosen = settings.filters.get(spec.name)
     state = _estimate(run, spec.name, chosen, settings)
     if spec.rate is not None:
@@ -271,6 +273,16 @@ def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeS
                 "its derivative: choose another state, another filter or leave the run out"
             )
     return state
+
+
+def _refuse_wrap(run: Trajectory, name: str) -> None:
+    unit = run.channel(name).unit
+    if wrap := wrapping(run.time, run[name], unit):
+        raise DfsmError(
+            f"{run.where}: state '{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''} "
+            f"({wrap.times} times, first at {wrap.first:g} s), so that its derivative jumps there: "
+            "unwrap it (numpy.unwrap), or take its speed as the state"
+        )
 
 
 def _estimate(

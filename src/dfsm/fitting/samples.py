@@ -17,6 +17,7 @@ from dfsm.data.derivatives import (
     state_units,
 )
 from dfsm.data.info import gap_warning
+from dfsm.data.slower import fill_slower
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
@@ -118,6 +119,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     if settings.azimuth is not None and settings.azimuth.angle is not None:
         names[settings.azimuth.angle] = None
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
+    runs = [fill_slower(r, settings.slower) for r in runs]
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
         names.update(dict.fromkeys(settings.azimuth.field))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.shapes import Series
 
@@ -11,6 +12,8 @@ _SHARE = 1e-3
 # Rounding that is coarser than this share of a step hides whether a mesh is equidistant.
 _COARSE = 0.1
 _MOST_DECIMALS = 8
+# Samples that make a rate; three at equal distances happen by chance.
+_FEWEST = 4
 
 
 def time_step(time: Series) -> float | None:
@@ -72,6 +75,28 @@ def without_rounding(time: Series) -> Series:
     near = (line for line in lines if np.abs(line - time).max() <= unit / 2 + slack)
     line = next(near, start + slope * index)
     return line if np.abs(line - time).max() > slack else time
+
+
+def own_interval(time: Series, present: NDArray[np.bool_]) -> float | None:
+    """Interval of a signal that has a sample at some times of a mesh only, at regular ones.
+
+    Parameters
+    ----------
+    time
+        Strictly increasing times in s, shape ``(time,)``.
+    present
+        Where the signal has a sample, shape ``(time,)``.
+
+    Returns
+    -------
+    float or None
+        In s; None where no sample is missing between the first and the last, where they are not
+        equidistant, or fewer than four.
+    """
+    rows = np.flatnonzero(present)
+    if len(rows) < _FEWEST or len(rows) == rows[-1] - rows[0] + 1:
+        return None
+    return time_step(time[rows])
 
 
 def _rounding(time: Series, step: float) -> float:
