@@ -13,6 +13,7 @@ from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
     differentiate,
+    lead_in,
     state_names,
     state_units,
 )
@@ -125,9 +126,10 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         names.update(dict.fromkeys(settings.azimuth.field))
         for run in runs:
             require_field(run, settings.azimuth)
-    picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
+    picked = [r.select(names).with_roles(roles) for r in runs]
     for run in picked:
         run.window(settings.start, settings.stop)
+        lead_in(run, settings.start, settings.derivatives).require_finite()
     data = Dataset(picked)
     for name in names:
         data.channel(name)
@@ -165,7 +167,8 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
     signals = _signals(data, settings)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
-    for run in track(data, "derivatives"):
+    for whole_run in track(data, "derivatives"):
+        run = lead_in(whole_run, settings.start, settings.derivatives)
         extracted = differentiate(run, settings.states, settings.derivatives)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory

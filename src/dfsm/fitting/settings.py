@@ -32,7 +32,7 @@ class FitSettings:
         Channel names by role. Disturbances are known signals that nobody chooses; none of them
         may hold a response of the system.
     start, stop
-        Time window in s used for training; derivatives are taken on the whole run before.
+        Time window in s used for training; derivatives are taken on a little more, see `lead_in`.
     derivatives
         How derivatives are extracted.
     linear

@@ -1,8 +1,8 @@
 """MAT files of version 4: matrices one after the other, as old programs and Modelica tools write.
 
-Each has a header of five integers, MOPT (thousands: byte order; tens: type of number; ones: what
-it is, numbers, text or sparse), rows, columns, whether there is an imaginary part, and the length of the name; then
-the name with a zero at its end, and the numbers column by column.
+Each has a header of five integers: MOPT (thousands: byte order; tens: type of number; ones: kind,
+numbers, text or sparse), rows, columns, whether there is an imaginary part, length of the name. The
+name with a zero at its end follows, and the numbers column by column.
 
 Source: MATLAB MAT-File Format, The MathWorks, chapter 2.
 """
