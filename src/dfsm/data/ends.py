@@ -18,8 +18,10 @@ _ALMOST_ALL = 0.7
 # What is a jump and what a standstill, in changes from row to row beside it, and the share of the
 # usual change (RMS over the run) that counts as motion.
 _JUMP, _MOTION = 3.0, 0.3
-# Rows beside the boundary that tell how channels move there.
-_BESIDE = 4
+# Rows beside the boundary that tell how channels move there; one may be at a turn for a while.
+_BESIDE, _WHILE = 4, 20
+# Times the longest row of equal rows inside that those at the end must be: some files round a lot.
+_LONGER = 3
 
 
 def recorded_rows(time: Array, values: Array) -> tuple[slice, list[str]]:
@@ -49,7 +51,7 @@ def recorded_rows(time: Array, values: Array) -> tuple[slice, list[str]]:
         back = values[: count - tail + 1][::-1]
         if _jumps(back):
             stop = count - tail
-        elif _freezes(back):
+        elif tail > _LONGER * _longest(values[: count - tail]) and _freezes(back):
             stop = count - tail + 1  # the first of the equal rows is as it was
         if stop < count:
             notes.append(_told("last", values[stop:], time[stop:]))
@@ -63,19 +65,25 @@ def _equal_rows(values: Array) -> int:
     return count if count >= _FEWEST else 0
 
 
-def _changes(values: Array) -> tuple[Array, Array, Array]:
+def _longest(values: Array) -> int:
+    """Length of the longest row of equal rows, at least 1."""
+    changes = np.flatnonzero((np.diff(values, axis=0) != 0).any(axis=1))
+    return int(np.diff(changes, prepend=-1, append=len(values) - 1).max())
+
+
+def _changes(values: Array, rows: int) -> tuple[Array, Array, Array]:
     """Of channels that vary: the first change, the usual one, and that in the rows beside (RMS)."""
     changes = np.diff(values[:, np.isfinite(values).all(axis=0)], axis=0)
     with np.errstate(over="ignore"):  # infinite is large enough to compare with
         usual = np.sqrt(np.mean(changes[1:] ** 2, axis=0))
-        beside = np.sqrt(np.mean(changes[1 : 1 + _BESIDE] ** 2, axis=0))
+        beside = np.sqrt(np.mean(changes[1 : 1 + rows] ** 2, axis=0))
     varies = usual > 0
     return np.abs(changes[0, varies]), usual[varies], beside[varies]
 
 
 def _jumps(values: Array) -> bool:
     """Whether almost all channels jump from the first row, the last equal one, to the second."""
-    first, usual, beside = _changes(values)
+    first, usual, beside = _changes(values, _BESIDE)
     jump = first > _JUMP * np.maximum(beside, _MOTION * usual)
     return len(jump) > 0 and bool(jump.mean() >= _ALMOST_ALL)
 
@@ -85,7 +93,7 @@ def _freezes(values: Array) -> bool:
 
     One that has settled moves less and less before.
     """
-    _, usual, beside = _changes(values)
+    _, usual, beside = _changes(values, _WHILE)
     moving = beside > _MOTION * usual
     return len(moving) > 0 and bool(moving.mean() >= _ALMOST_ALL)
 

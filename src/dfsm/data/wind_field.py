@@ -166,7 +166,7 @@ def field_signals(
     Warns
     -----
     DfsmWarning
-        The two means differ by more than shear and chance make.
+        They differ by more than shear and chance make.
     """
     if not 0 <= harmonics < _AROUND // 2:
         raise DfsmError(f"{harmonics} harmonics were asked for, expected 0 to {_AROUND // 2 - 1}")
@@ -193,12 +193,12 @@ def field_signals(
 
 
 def _check_mean(field: WindField, mean: float) -> None:
-    """Compare the mean over the disk with the mean wind that the field states and moves with."""
+    """Compare the mean over the disk with the mean wind that the field states."""
     stated = field.mean_wind
     if not abs(mean - stated) <= _OTHER_MEAN * stated:
         raise DfsmError(
             f"{field.path}: the wind over the disk is {mean:.4g} m/s on average, the field states "
-            f"{stated:.4g} m/s, with which it moves: give the field with its mean in it"
+            f"{stated:.4g} m/s and moves with it: give the field with its mean in it"
         )
     if abs(mean - stated) > _SAME_MEAN * stated:
         warnings.warn(

@@ -230,10 +230,15 @@ def _without_cut(rows: list[Row], layout: Layout, notes: list[str]) -> list[Row]
         return rows
     last, before = rows[-1], rows[-1 - _BEFORE : -1]
     whole = len(last.cells) == len(layout.names) and last.cells[-1].strip() != ""
-    if whole and not (_is_value(last.cells[-1]) and _shorter(last.cells[-1], before)):
+    if whole and _is_value(last.cells[-1]) and not _shorter(last.cells[-1], before):
         return rows
+    at = layout.time or 0
+    first = last.cells[at if at < len(last.cells) else 0]
     # A footer in words is told as such.
-    if not _is_value(last.cells[layout.time or 0]):
+    if not (_is_value(first) or is_stamp(first)):
+        return rows
+    # Words may stand in the last column.
+    if whole and before and not any(_is_value(row.cells[-1]) for row in before):
         return rows
     notes.append(
         f"the file ends without a line end inside the record of line {last.line}, as where a run "
