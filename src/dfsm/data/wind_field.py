@@ -193,7 +193,6 @@ def field_signals(
 
 
 def _check_mean(field: WindField, mean: float) -> None:
-    """Compare the mean over the disk with the mean wind that the field states."""
     stated = field.mean_wind
     if not abs(mean - stated) <= _OTHER_MEAN * stated:
         raise DfsmError(
