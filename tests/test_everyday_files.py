@@ -181,6 +181,40 @@ def test_time_stamps_in_parquet_and_stamps_that_are_open(tmp_path):
     assert "'later' in 'time' is no time stamp" in sentence(put(tmp_path / "c.csv", text))
 
 
+# -- HAWC2 --------------------------------------------------------------------------------------
+
+
+def test_hawc2_in_text_and_binary(tmp_path):
+    told = [
+        ("Time", "s", "Time"),
+        ("Wind", "m/s", "here"),
+        ("Wind", "m/s", "there"),
+        ("Q", "-", ""),
+    ]
+    table = np.stack([TIME + 0.1, 8 + np.sin(TIME), 9 + np.cos(TIME), TIME**2], axis=1)
+    lines = [f"{i:6d}      {n:<31}{u:<11}{d}" for i, (n, u, d) in enumerate(told, start=1)]
+    scales = np.abs(table).max(axis=0) / 32000
+    for form in ("ASCII", "BINARY"):
+        head = ["_" * 60, f"  {len(TIME):8d} {4:6d} {4.0:14.3f}       {form}", "", "  Channel", ""]
+        tail = ["", "Scale factors:", *(f"  {s:.9E}" for s in scales)] if form == "BINARY" else []
+        put(tmp_path / "a.sel", "\n".join([*head, *lines, *tail]) + "\n")
+        if form == "ASCII":
+            np.savetxt(tmp_path / "a.dat", table, fmt="%13.6E")
+        else:
+            np.rint(table / scales).T.astype("<i2").tofile(tmp_path / "a.dat")
+        run = read(tmp_path / "a.dat")
+        assert run.names == ("Wind: here", "Wind: there", "Q")
+        assert [c.unit for c in run.channels] == ["m/s", "m/s", ""]
+        np.testing.assert_allclose(run.time, table[:, 0], atol=0.51 * scales[0])
+        assert (np.abs(run.values - table[:, 1:]) <= 0.51 * scales[1:] + 1e-6).all()
+        assert read(tmp_path / "a.sel").digest == run.digest
+    np.testing.assert_allclose([c.step for c in run.channels], scales[1:], rtol=1e-8)
+    put(tmp_path / "a.dat", (tmp_path / "a.dat").read_bytes()[:-2])
+    assert "318 bytes, but its .sel announces 4 channels and 40 scans" in sentence(
+        tmp_path / "a.sel"
+    )
+
+
 # -- MATLAB -------------------------------------------------------------------------------------
 
 
@@ -249,7 +283,7 @@ def test_damaged_tags_are_sentences(tmp_path):
 def test_hdf5_from_matlab(tmp_path):
     path = tmp_path / "a.mat"
     try:
-        import h5py
+        import h5py  # pyright: ignore[reportMissingImports]
     except ImportError:
         path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n")
         assert "needs h5py: pip install 'dfsm[hdf5]'" in sentence(path)

@@ -12,6 +12,7 @@ from pathlib import Path
 from dfsm.core.files import existing_file
 from dfsm.core.progress import track
 from dfsm.data.info import ChannelInfo, RunInfo, describe, gap_warning
+from dfsm.data.readers.hawc2 import is_hawc2, read_hawc2
 from dfsm.data.readers.openfast import read_openfast
 from dfsm.data.readers.tables import read_table, write_table
 from dfsm.data.readers.turbsim import read_turbsim
@@ -40,7 +41,7 @@ __all__ = [
 ]
 
 OPENFAST = {".outb", ".out", ".dbg", ".dbg2", ".dbg3"}
-TABLES = {".csv", ".txt", ".tsv", ".parquet", ".pq", ".mat"}
+TABLES = {".csv", ".txt", ".tsv", ".parquet", ".pq", ".mat", ".hdf5", ".h5"}
 # How files begin that are recognised under any name.
 SIGNATURES = {b"PAR1": read_table, b"MATLAB": read_table, b"\x89HDF": read_table} | {
     bytes([n, 0]): read_openfast for n in (1, 2, 3, 4)
@@ -53,8 +54,9 @@ def read(path: str | Path, step: float | None = None) -> Trajectory:
     Parameters
     ----------
     path
-        OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, `.csv` (`.txt`, `.tsv`), `.parquet` or `.mat`;
-        under another name, binary files are recognised by their first bytes.
+        OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, HAWC2 `.sel` or `.hdf5`, `.csv` (`.txt`,
+        `.tsv`), `.parquet` or `.mat`; under another name, binary files are recognised by their
+        first bytes.
     step
         Interval between samples in s for tables that hold no time.
 
@@ -72,6 +74,8 @@ def read(path: str | Path, step: float | None = None) -> Trajectory:
     suffix = path.suffix.lower()
     if suffix in OPENFAST:
         return read_openfast(path)
+    if is_hawc2(path):
+        return read_hawc2(path)
     if suffix in TABLES:
         return read_table(path, step)
     with path.open("rb") as stream:

@@ -76,7 +76,7 @@ def _tree(flat: dict[str, np.ndarray]) -> dict[str, Any]:
 
 def _main(source: str, target: str) -> int:
     try:
-        import h5py
+        import h5py  # pyright: ignore[reportMissingImports]
     except ImportError:
         return _NO_H5PY
     try:

@@ -23,6 +23,7 @@ from dfsm.data.readers.columns import (
     time_column,
     uniform_times,
 )
+from dfsm.data.readers.hawc2 import from_gtsdf, is_gtsdf
 from dfsm.data.readers.hdf5 import read_hdf5
 from dfsm.data.readers.mat4 import is_mat4, read_mat4
 from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
@@ -46,7 +47,10 @@ def read_mat(path: Path, step: float | None = None) -> Trajectory:
     with path.open("rb") as stream:
         start = stream.read(520)
     if start.startswith((HDF5, b"MATLAB 7.3")) or start[512:] == HDF5:
-        content = {k: v for k, v in read_hdf5(path).items() if not k.startswith("@")}
+        content = read_hdf5(path)
+        if is_gtsdf(content):
+            return from_gtsdf(path, content)
+        content = {k: v for k, v in content.items() if not k.startswith("@")}
     else:
         try:
             content = read_mat4(path) if is_mat4(start) else read_mat5(path)
