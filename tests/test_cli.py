@@ -36,7 +36,7 @@ HOSTILE = (
 
 
 def test_info_lists_every_run_and_channel(here, dfsm):
-    shown = dfsm("info", "train/a.csv", "train/*.outb")
+    shown = dfsm("info", "--each", "train/a.csv", "train/*.outb")
     assert shown.code == 0
     assert shown.err == ""
     assert not CONSOLE.search(shown.out)

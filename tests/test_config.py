@@ -85,7 +85,7 @@ def test_defaults_are_those_of_the_fit(tmp_path):
 
 def test_no_setting_of_the_fit_is_out_of_reach():
     known = set(Config.model_fields) | {"states", "controls", "disturbances", "parameters"}
-    known |= {"features", "outputs", "start", "stop", "hub_height"}
+    known |= {"features", "outputs", "start", "stop", "hub_height", "slower"}
     assert {f.name for f in fields(FitSettings)} <= known
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from dfsm.data.info import describe
 from dfsm.data.readers import read
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind import wind_warning
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 
@@ -28,8 +29,12 @@ def test_a_bundled_run():
     assert pitch.max == run["PtfmPitch"].max()
     np.testing.assert_allclose(pitch.mean, np.sum(run["PtfmPitch"]) / 14001)
     np.testing.assert_allclose(pitch.std, np.sqrt(np.var(run["PtfmPitch"])))
+    transient, relative, same, azimuth = info.warnings
+    assert transient.startswith("a transient, until 6.1 s in 'PtfmRVyt', is far from all")
+    assert relative == wind_warning("RtVAvgxh")
     # with pitch as the only motion the nacelle turns as the platform does
-    assert info.warnings == ("'NcIMURAys' holds the same data as 'PtfmRAyt'",)
+    assert same == "'NcIMURAys' holds the same data as 'PtfmRAyt'"
+    assert azimuth.startswith("'LSSTipPxa' wraps at 360 deg, 59 times, first at ")
 
 
 def test_constant_nan_duplicate_and_invalid_channels_are_told():

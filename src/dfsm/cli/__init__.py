@@ -24,11 +24,14 @@ from dfsm.cli.terminal import (
     Files,
     ParameterFile,
     Quiet,
+    SampleStep,
+    as_in_fit,
     fit_start,
     lines,
     parametrized,
     print_json,
     say,
+    tell_notes,
     working,
 )
 from dfsm.cli.wind import wind
@@ -61,18 +64,25 @@ IntervalFile = Annotated[
 
 
 @app.command()
-def info(files: Files, as_json: AsJson = False) -> None:
+def info(
+    files: Files,
+    each: Annotated[bool, typer.Option("--each", help="A table for every run.")] = False,
+    step: SampleStep = None,
+    as_json: AsJson = False,
+) -> None:
     """List channels, units, ranges, sampling and quantisation, and what looks wrong."""
-    from dfsm.cli.tables import print_info
+    from dfsm.cli.tables import print_info, print_merged
     from dfsm.data.info import describe
     from dfsm.data.readers import read_all
 
     with show_progress():
-        infos = [describe(run) for run in read_all(files)]
+        infos = [describe(run) for run in read_all(files, step=step)]
     if as_json:
         print_json([i.to_dict() for i in infos])
-    else:
+    elif each or len(infos) == 1:
         print_info(infos)
+    else:
+        print_merged(infos)
 
 
 @app.command()
@@ -82,6 +92,7 @@ def init(
         "config.yaml"
     ),
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    step: SampleStep = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a commented configuration with the channels of the files."""
@@ -92,7 +103,7 @@ def init(
     if output.exists() and not force:
         raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
     with working(quiet):
-        write_config(files, output)
+        write_config(files, output, step)
     say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
 
@@ -115,6 +126,7 @@ def fit(
     with locked(output):
         with working(quiet):
             settings, runs = load_config(config)
+            tell_notes(runs, quiet)
             result = run_fit(runs, settings.fit_settings(), settings.refine)
             model = result.model
         replaced = output.exists() and bool(visible(output))
@@ -155,10 +167,12 @@ def compare(
     check_output(output, candidates)
     files, hold_out = settings.compare.validation, settings.compare.hold_out
     with working(quiet):
-        runs = settings.with_parameters(read_all(settings.data.train, config.parent))
+        step = settings.data.step
+        runs = settings.with_parameters(read_all(settings.data.train, config.parent, step))
         validation = None
         if files is not None:
-            validation = settings.with_parameters(read_all(files, config.parent))
+            validation = settings.with_parameters(read_all(files, config.parent, step))
+        tell_notes([*runs, *(validation or [])], quiet)
         ranking = run_compare(
             candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
         )
@@ -223,7 +237,8 @@ def validate(
     start = fit_start(main) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     with working(quiet):
-        runs = parametrized(read_all(files), parameters)
+        runs = as_in_fit(main, parametrized(read_all(files), parameters))
+        tell_notes(runs, quiet)
         for path in targets:
             check_file(path, [wall_times, intervals, parameters, *(r.source for r in runs)])
         if wall_times is not None:
@@ -253,7 +268,11 @@ def simulate(
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
     method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
     step: Annotated[
-        float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
+        float | None,
+        typer.Option(
+            help="Largest RK4 step in s; default the run's samples, whose interval it tells where "
+            "the file holds no times."
+        ),
     ] = None,
     intervals: IntervalFile = None,
     parameters: ParameterFile = None,
@@ -289,7 +308,8 @@ def simulate(
     if calibrated is not None:
         calibrated.check(surrogate)
     with working(quiet):
-        recorded = parametrized([read(run)], parameters)[0]
+        (recorded,) = as_in_fit(surrogate, parametrized([read(run, step)], parameters))
+        tell_notes([recorded], quiet)
         if inputs is not None:
             recorded = with_inputs(recorded, read(inputs), surrogate.signals, start, stop)
         recorded = with_changes(recorded, changes or (), surrogate.signals)

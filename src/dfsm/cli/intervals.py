@@ -11,9 +11,11 @@ from dfsm.cli.terminal import (
     Files,
     ParameterFile,
     Quiet,
+    as_in_fit,
     fit_start,
     parametrized,
     say,
+    tell_notes,
     working,
 )
 
@@ -42,7 +44,8 @@ def calibrate(
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     with working(quiet):
-        runs = parametrized(read_all(files), parameters)
+        runs = as_in_fit(surrogate, parametrized(read_all(files), parameters))
+        tell_notes(runs, quiet)
         check_file(output, [*model.iterdir(), parameters, *(run.source for run in runs)])
         intervals = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
     write_or_keep(intervals.save, output)

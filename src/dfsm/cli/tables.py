@@ -24,7 +24,7 @@ _LONG = 45
 
 
 def print_info(runs: Sequence[RunInfo]) -> None:
-    """Print what `dfsm info` says, one table per run."""
+    """Print what `dfsm info` says of each run, one table per run."""
     console = _console()
     for run in runs:
         sampling = (
@@ -42,6 +42,44 @@ def print_info(runs: Sequence[RunInfo]) -> None:
         console.print(table)
         for text in run.warnings:
             console.print(_text(f"warning: {text}"))
+
+
+def print_merged(runs: Sequence[RunInfo]) -> None:
+    """Print what `dfsm info` says of several runs: one table over all, every warning once."""
+    from dfsm.data.info import counted, merged
+
+    console = _console()
+    console.print(_text(f"{len(runs)} runs, {_sampling(runs)}"))
+    table = _table("channel", "unit", "min", "max", "runs", "step")
+    for c in merged(runs):
+        steps = "–" if c.steps is None else " to ".join(f"{s:.3g}" for s in dict.fromkeys(c.steps))
+        of = "all" if c.runs == len(runs) else str(c.runs)
+        table.add_row(
+            _text(c.name), _text(" or ".join(c.units)), f"{c.min:.5g}", f"{c.max:.5g}", of, steps
+        )
+    console.print(table)
+    for text in counted([(run.source or run.name, run.warnings) for run in runs]):
+        console.print(_text(f"warning: {text}"))
+    console.print("dfsm info --each prints every run by itself")
+
+
+def _sampling(runs: Sequence[RunInfo]) -> str:
+    """Spans and intervals of several runs, in one line."""
+    intervals = sorted({r.interval for r in runs if r.interval is not None})
+    samples = sorted({r.samples for r in runs})
+    parts = [
+        f"{_range(samples, 'd')} samples",
+        f"{min(r.start for r in runs):g} to {max(r.stop for r in runs):g} s",
+    ]
+    parts += [f"every {_range(intervals, 'g')} s"] if intervals else []
+    irregular = sum(r.interval is None for r in runs)
+    parts += [f"{irregular} of them irregular"] if irregular else []
+    return ", ".join(parts)
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    low, high = format(values[0], form), format(values[-1], form)
+    return low if low == high else f"{low} to {high}"
 
 
 def print_validation(validation: Validation) -> None:

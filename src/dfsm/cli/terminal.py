@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
 
 Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+SampleStep = Annotated[
+    float | None,
+    typer.Option("--step", help="Interval between samples in s, for files without times."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 ParameterFile = Annotated[
     Path | None, typer.Option("--parameters", help="CSV: a column of runs, one per parameter.")
@@ -42,6 +47,22 @@ def working(quiet: bool) -> Iterator[None]:
 def fit_start(model: DFSM) -> float | None:
     """Start of the fit's time window in s: where a simulation starts unless told otherwise."""
     return model.provenance.record.get("settings", {}).get("start")
+
+
+def as_in_fit(model: DFSM, runs: Iterable[Trajectory]) -> list[Trajectory]:
+    """Runs whose slower channels are filled as they were in the fit."""
+    from dfsm.data.slower import fill_slower
+
+    between = model.provenance.record.get("settings", {}).get("slower")
+    return [fill_slower(run, between) for run in runs]
+
+
+def tell_notes(runs: Iterable[Trajectory], quiet: bool) -> None:
+    """Print what readers left out or changed, each sentence once, on standard error."""
+    from dfsm.data.info import counted
+
+    for text in () if quiet else counted([(run.where, run.notes) for run in runs]):
+        print(printable(f"note: {text}"), file=sys.stderr)
 
 
 def lines(text: str) -> str:

@@ -16,6 +16,7 @@ from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
 from dfsm.data.parameters import Table, names_in, read_parameters, with_parameters
 from dfsm.data.readers import read_all
+from dfsm.data.slower import Slower
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
@@ -48,12 +49,18 @@ class DataConfig(Strict):
         Time window in s; null leaves that end open.
     hub_height
         In m; adds the corrected rotor wind ``RtVAvgxhCorr`` to every run.
+    step
+        Interval between samples in s of files that hold no time.
+    slower
+        What channels with fewer samples than their table do in between: hold or linear, or by name.
     """
 
     train: list[str]
     start: float | None = None
     stop: float | None = None
     hub_height: float | None = None
+    step: float | None = None
+    slower: Slower = None
 
 
 class SignalConfig(Strict):
@@ -152,6 +159,7 @@ class Config(Strict):
             start=self.data.start,
             stop=self.data.stop,
             hub_height=self.data.hub_height,
+            slower=self.data.slower,
             derivatives=self.derivatives,
             linear=self.linear,
             terms=tuple(self._rooted(term) for term in self.terms),
@@ -200,7 +208,8 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
         _check_together(config)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
-    return config, config.with_parameters(read_all(config.data.train, path.parent))
+    runs = read_all(config.data.train, path.parent, config.data.step)
+    return config, config.with_parameters(runs)
 
 
 def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:

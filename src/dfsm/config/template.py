@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 from ruamel.yaml import YAML
 
 from dfsm.core.files import check_file, write_file
+from dfsm.core.types import Array
 from dfsm.data.info import ChannelInfo, describe
 from dfsm.data.readers import read_all
 from dfsm.data.trajectory import Trajectory
@@ -32,6 +34,8 @@ data:
   start: {start}      # s; earlier samples (the start-up transient) are not used
   stop: null       # s
   hub_height: {hub_height}   # m; a number adds the channel RtVAvgxhCorr to every run
+  step: {step}       # s; interval between samples of files that hold no time
+  slower: null     # hold or linear: channels with fewer samples than their table, or {{cmd: hold}}
 
 # Channels (unit, range over the first run{constant}):
 {channels}
@@ -85,7 +89,7 @@ seed: 0
 """
 
 
-def write_config(files: Sequence[str], path: Path) -> None:
+def write_config(files: Sequence[str], path: Path, step: float | None = None) -> None:
     """Write a configuration for some runs.
 
     Parameters
@@ -94,25 +98,30 @@ def write_config(files: Sequence[str], path: Path) -> None:
         Result files or patterns; they become ``data.train``.
     path
         File to write; relative patterns are rewritten to start from its folder.
+    step
+        Interval between samples in s of files that hold no time.
 
     Raises
     ------
     DfsmError
         A file cannot be read, or `path` not written.
     """
-    runs = read_all(files)
+    runs = read_all(files, step=step)
     check_file(path, [r.source for r in runs])
-    text = fill(runs, _relative([r.source or r.name for r in runs], path.parent), path.name)
+    names = _relative([r.source or r.name for r in runs], path.parent)
+    text = fill(runs, names, path.name, step)
     with write_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
+def fill(
+    runs: Sequence[Trajectory], train: Sequence[str], name: str, step: float | None = None
+) -> str:
     """Fill the template with channels that all runs share."""
     first = describe(runs[0])
     common = set(runs[0].names).intersection(*(r.names for r in runs))
     shared = {c.name: c for c in first.channels if c.name in common}
-    varying = {n: c for n, c in shared.items() if any(r[n].min() < r[n].max() for r in runs)}
+    varying = {n: c for n, c in shared.items() if any(_varies(r[n]) for r in runs)}
     parameters = [n for n in shared if n not in varying and _differs(n, runs)]
     listed = [c for n, c in shared.items() if n in varying or n in parameters]
     wind = next((w for w in _WINDS if w in varying), None)
@@ -126,6 +135,7 @@ def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
         train=_block(train),
         start=_TRANSIENT if long else "null",
         hub_height="null",
+        step="null" if step is None else f"{step:g}",
         constant="" if len(listed) == len(first.channels) else "; constant ones left out",
         channels="\n".join(_comment(c) for c in listed),
         states=_block([{"name": s, "order": 2} for s in states]),
@@ -139,6 +149,12 @@ def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
         ),
         azimuth=_azimuth(states, varying),
     )
+
+
+def _varies(values: Array) -> bool:
+    """Whether a channel moves; one with fewer samples than its table may."""
+    finite = values[np.isfinite(values)]
+    return len(finite) > 0 and bool(finite.min() < finite.max())
 
 
 def _differs(name: str, runs: Sequence[Trajectory]) -> bool:

@@ -18,6 +18,7 @@ import numpy as np
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
 from dfsm.core.units import agree
+from dfsm.data.signs import wrapping
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.filters import Filter, filtered
@@ -32,10 +33,16 @@ __all__ = [
     "cubic_spline",
     "differentiate",
     "kinematic_rows",
+    "lead_in",
     "smoothing_spline",
     "state_names",
     "state_units",
 ]
+
+
+# Samples before the first that is used, which smoothing may need; filter windows, and periods of a
+# cutoff, after which filters have forgotten.
+_MARGIN_SAMPLES, _WINDOWS, _PERIODS = 200, 2.0, 5.0
 
 
 @settings_class
@@ -167,6 +174,31 @@ def kinematic_rows(states: Sequence[StateSpec]) -> dict[int, int]:
     return {i: len(states) + j for j, i in enumerate(second)}
 
 
+def lead_in(run: Trajectory, start: float | None, settings: DerivativeSettings) -> Trajectory:
+    """A run from `start` less what derivatives need before it: what lies earlier has no say.
+
+    A bad sample at the beginning, and a transient that is left out, would otherwise decide with the
+    rest how much is smoothed.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    start
+        First time in s at which derivatives are wanted; None for all.
+    settings
+        Filters remember for longer than splines.
+    """
+    if start is None or start <= run.time[0]:
+        return run
+    memory = [
+        _WINDOWS * f.window if f.window is not None else _PERIODS / (f.cutoff or np.inf)
+        for f in settings.filters.values()
+    ]
+    usual = run.duration / (len(run) - 1)
+    return run.window(start - max([_MARGIN_SAMPLES * usual, *memory]), None)
+
+
 def differentiate(
     trajectory: Trajectory,
     states: Sequence[StateSpec],
@@ -177,8 +209,8 @@ def differentiate(
     A recorded rate or acceleration is used as it stands (filtered where the state is), except
     that a recorded rate which must itself be differentiated is smoothed like a state.
     With a filter the state is first freed of noise, then filtered, then differentiated, so that
-    q̇ stays the derivative of q. Smooth the whole run and cut the time window afterwards: the
-    second derivative is least certain in the last few samples.
+    q̇ stays the derivative of q. Smooth more than is used and cut the time window afterwards (see
+    `lead_in`): the second derivative is least certain in the first and last few samples.
 
     Parameters
     ----------
@@ -250,6 +282,7 @@ class _State:
 
 def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeSettings) -> _State:
     run.select(spec.channels).require_finite()
+    _refuse_wrap(run, spec.name)
     chosen = settings.filters.get(spec.name)
     state = _estimate(run, spec.name, chosen, settings)
     if spec.rate is not None:
@@ -272,6 +305,16 @@ def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeS
                 "its derivative: choose another state, another filter or leave the run out"
             )
     return state
+
+
+def _refuse_wrap(run: Trajectory, name: str) -> None:
+    unit = run.channel(name).unit
+    if wrap := wrapping(run.time, run[name], unit):
+        raise DfsmError(
+            f"{run.where}: state '{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''} "
+            f"({wrap.times} times, first at {wrap.first:g} s), so that its derivative jumps there: "
+            "unwrap it (numpy.unwrap), or take its speed as the state"
+        )
 
 
 def _estimate(

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrapping
+from dfsm.data.slower import slower_warning
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind import wind_warning
+
+# What differs from run to run in sentences that say the same: lists of channels, and numbers.
+_CHANNELS = re.compile(r"\bin '[^']*'(?:, '[^']*')*(?: and \d+ more channels)?")
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -194,10 +202,13 @@ def _warnings(trajectory: Trajectory) -> list[str]:
     sentences = []
     if gap := gap_warning(trajectory):
         sentences.append(gap)
+    sentences += _starts(trajectory)
     seen: dict[bytes, str] = {}
     for name, values in zip(trajectory.names, trajectory.values.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
+        if slower := slower_warning(trajectory, name):
+            sentences.append(slower)
+        elif len(bad):
             sentences.append(
                 f"'{name}' has {len(bad)} NaN or infinite samples, the first at "
                 f"{trajectory.time[bad[0]]:g} s"
@@ -214,7 +225,123 @@ def _warnings(trajectory: Trajectory) -> list[str]:
             sentences.append(f"'{name}' holds the same data as '{seen[data]}'")
         else:
             seen[data] = name
+            sentences += _looks(trajectory, name)
     return [*sentences, *trajectory.notes]
+
+
+def _looks(run: Trajectory, name: str) -> list[str]:
+    """What a channel is, from its name and its samples."""
+    sentences, unit = [], run.channel(name).unit
+    if wrap := wrapping(run.time, run[name], unit):
+        sentences.append(
+            f"'{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''}, {wrap.times} times, "
+            f"first at {wrap.first:g} s: as a state it must go on (numpy.unwrap)"
+        )
+    if interval := held_interval(run.time, run[name]):
+        sentences.append(
+            f"'{name}' changes every {interval:g} s only and stays as it was in between: a slower "
+            "record, or a held command"
+        )
+    if text := wind_warning(name):
+        sentences.append(text)
+    return sentences
+
+
+def _starts(run: Trajectory) -> list[str]:
+    """What is wrong with the beginning of a run."""
+    sentences = []
+    jumping = [n for n in run.names if jumps_at_first(run[n])]
+    if jumping:
+        sentences.append(
+            f"the first sample has nothing to do with the next in {_some(jumping)}: leave it out "
+            "with data.start"
+        )
+    ends = {n: t for n in run.names if (t := transient_end(run.time, run[n])) is not None}
+    if ends:
+        sentences.append(
+            f"a transient, until {max(ends.values()):.4g} s in {_some(list(ends))}, is far from "
+            "all that follows: start behind it with data.start, unless it is what matters"
+        )
+    return sentences
+
+
+def _some(names: Sequence[str], most: int = 4) -> str:
+    """The first names, and how many there are beside them."""
+    shown = ", ".join(f"'{n}'" for n in names[:most])
+    return shown + (f" and {len(names) - most} more channels" if len(names) > most else "")
+
+
+def counted(told: Iterable[tuple[str, Iterable[str]]]) -> list[str]:
+    """Sentences about several runs, each once: where first, and how often.
+
+    Parameters
+    ----------
+    told
+        Run and its sentences. Those that differ in numbers or lists of channels count as one.
+
+    Returns
+    -------
+    list[str]
+        ``"a.outb: 'x' is constant (7) (and 3 more runs)"``, in the order of their first occurrence.
+    """
+    found: dict[str, tuple[str, set[str]]] = {}
+    for where, sentences in told:
+        for sentence in sentences:
+            parts = _CHANNELS.sub("in them", sentence).split("'")
+            parts[::2] = [_NUMBER.sub("#", part) for part in parts[::2]]
+            _, runs = found.setdefault("'".join(parts), (f"{where}: {sentence}", set()))
+            runs.add(where)
+    return [
+        first + (f" (and {len(runs) - 1} more run{'s' * (len(runs) > 2)})" if len(runs) > 1 else "")
+        for first, runs in found.values()
+    ]
+
+
+@dataclass(frozen=True)
+class MergedChannel:
+    """One channel over several runs.
+
+    Attributes
+    ----------
+    name, units
+        As in the files; several units where runs do not agree.
+    min, max
+        Over the finite samples of all runs, in the channel's unit; NaN where there is none.
+    runs
+        How many runs have it.
+    steps
+        Smallest and largest quantisation step; None where no run states one.
+    """
+
+    name: str
+    units: tuple[str, ...]
+    min: float
+    max: float
+    runs: int
+    steps: tuple[float, float] | None
+
+
+def merged(runs: Sequence[RunInfo]) -> list[MergedChannel]:
+    """Describe every channel over all runs, in the order of their first occurrence."""
+    channels: dict[str, list[ChannelInfo]] = {}
+    for run in runs:
+        for channel in run.channels:
+            channels.setdefault(channel.name, []).append(channel)
+    result = []
+    for name, parts in channels.items():
+        steps = [c.step for c in parts if c.step is not None]
+        known = [c for c in parts if not math.isnan(c.min)]
+        result.append(
+            MergedChannel(
+                name,
+                tuple(dict.fromkeys(c.unit for c in parts)),
+                min((c.min for c in known), default=math.nan),
+                max((c.max for c in known), default=math.nan),
+                len(parts),
+                (min(steps), max(steps)) if steps else None,
+            )
+        )
+    return result
 
 
 def _without_nan(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, missing, printable
-from dfsm.numerics.time_mesh import time_step
+from dfsm.numerics.time_mesh import own_interval, time_step
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -310,6 +310,14 @@ class Trajectory:
         if bad.any():
             column = int(np.flatnonzero(bad.any(axis=0))[0])
             rows = np.flatnonzero(bad[:, column])
+            interval = own_interval(self.time, ~bad[:, column])
+            if interval is not None:
+                name = self.names[column]
+                raise DfsmError(
+                    f"{self.where}: channel '{name}' has one sample every {interval:g} s, fewer "
+                    "than its table has rows: say what it does in between with data.slower: "
+                    f"{{{name}: hold}} or linear (in Python: FitSettings.slower, fill_slower)"
+                )
             raise DfsmError(
                 f"{self.where}: channel '{self.names[column]}' has {len(rows)} NaN or infinite "
                 f"samples, the first at {self.time[rows[0]]:g} s: leave the channel or that part "

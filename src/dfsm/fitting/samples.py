@@ -14,10 +14,12 @@ from dfsm.data.conversion import in_units_of
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
     differentiate,
+    lead_in,
     state_names,
     state_units,
 )
 from dfsm.data.info import gap_warning
+from dfsm.data.slower import fill_slower
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
@@ -122,14 +124,16 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         angle = [Channel(settings.azimuth.angle, "deg")]
         runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
+    runs = [fill_slower(r, settings.slower) for r in runs]
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
         names.update(dict.fromkeys(settings.azimuth.field))
         for run in runs:
             require_field(run, settings.azimuth)
-    picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
+    picked = [r.select(names).with_roles(roles) for r in runs]
     for run in picked:
         run.window(settings.start, settings.stop)
+        lead_in(run, settings.start, settings.derivatives).require_finite()
     data = Dataset(picked)
     for name in names:
         data.channel(name)
@@ -167,7 +171,8 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
     signals = _signals(data, settings)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
-    for run in track(data, "derivatives"):
+    for whole_run in track(data, "derivatives"):
+        run = lead_in(whole_run, settings.start, settings.derivatives)
         extracted = differentiate(run, settings.states, settings.derivatives)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory

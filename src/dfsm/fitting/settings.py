@@ -8,6 +8,7 @@ from dataclasses import field
 from dfsm.core.settings import require, settings_class
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
+from dfsm.data.slower import Slower
 from dfsm.data.trajectory import Role
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
@@ -31,7 +32,7 @@ class FitSettings:
         Channel names by role. Disturbances are known signals that nobody chooses; none of them
         may hold a response of the system.
     start, stop
-        Time window in s used for training; derivatives are taken on the whole run before.
+        Time window in s used for training; derivatives are taken on a little more, see `lead_in`.
     derivatives
         How derivatives are extracted.
     linear
@@ -49,6 +50,8 @@ class FitSettings:
     hub_height
         In m; adds the channel ``RtVAvgxhCorr``, the rotor wind without the platform's motion, to
         runs that only have ``RtVAvgxh``.
+    slower
+        What channels with fewer samples than their table do in between, see `fill_slower`.
     features
         Disturbances that are computed from others, see `Feature`; they follow those named.
     nonlinear_only
@@ -71,6 +74,7 @@ class FitSettings:
     azimuth: Azimuth | None = None
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()
+    slower: Slower = None
     terms: tuple[TermSettings, ...] = ()
     nonlinear_only: bool = True
     seed: int = 0

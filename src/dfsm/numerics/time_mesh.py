@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.shapes import Series
 
@@ -11,6 +12,8 @@ _SHARE = 1e-3
 # Rounding that is coarser than this share of a step hides whether a mesh is equidistant.
 _COARSE = 0.1
 _MOST_DECIMALS = 8
+# Samples that make a rate; three at equal distances happen by chance.
+_FEWEST = 4
 
 
 def time_step(time: Series) -> float | None:
@@ -40,6 +43,60 @@ def time_step(time: Series) -> float | None:
         return step
     # Both ends and the time between may each be half a unit off.
     return step if error <= _rounding(time, step) + slack else None
+
+
+def without_rounding(time: Series) -> Series:
+    """Times of an equidistant mesh without the rounding of their file.
+
+    At 0.00625 s, four decimals move times by up to 0.8 % of a step; a spline through the samples
+    would take that for motion.
+
+    Parameters
+    ----------
+    time
+        Times in s, shape ``(time,)``, at least two.
+
+    Returns
+    -------
+    ndarray
+        Times at the shortest step that rounds to these, where they are equidistant and rounded to
+        decimals or to single precision; otherwise the times as they are.
+    """
+    if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+        return time
+    step = time_step(time)
+    unit = 0.0 if step is None else _rounding(time, step)
+    if step is None or unit == 0.0:
+        return time
+    index, slack = np.arange(len(time)), 4 * np.spacing(np.abs(time).max())
+    slope, start = np.polyfit(index.astype(np.float64), time, 1)
+    # The shortest step that rounds to these times is the one that was meant.
+    lines = [time[0] + float(f"{slope:.{digits}g}") * index for digits in range(1, 10)]
+    near = (line for line in lines if np.abs(line - time).max() <= unit / 2 + slack)
+    line = next(near, start + slope * index)
+    return line if np.abs(line - time).max() > slack else time
+
+
+def own_interval(time: Series, present: NDArray[np.bool_]) -> float | None:
+    """Interval of a signal that has a sample at some times of a mesh only, at regular ones.
+
+    Parameters
+    ----------
+    time
+        Strictly increasing times in s, shape ``(time,)``.
+    present
+        Where the signal has a sample, shape ``(time,)``.
+
+    Returns
+    -------
+    float or None
+        In s; None where no sample is missing between the first and the last, where they are not
+        equidistant, or fewer than four.
+    """
+    rows = np.flatnonzero(present)
+    if len(rows) < _FEWEST or len(rows) == rows[-1] - rows[0] + 1:
+        return None
+    return time_step(time[rows])
 
 
 def _rounding(time: Series, step: float) -> float:

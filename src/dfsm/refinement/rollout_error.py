@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.types import Array, IntArray
-from dfsm.data.derivatives import differentiate
+from dfsm.data.derivatives import differentiate, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
@@ -105,7 +105,7 @@ def record_of(
     """
     s = model.signals
     run = completed(run, s)
-    extracted = differentiate(run, s.specs, s.derivatives)
+    extracted = differentiate(lead_in(run, start, s.derivatives), s.specs, s.derivatives)
     window = run.window(start, stop)
     count = int(window.duration / step * (1 + 1e-9))
     before = int((window.time[0] - run.time[0]) / step * (1 + 1e-9))
@@ -118,7 +118,7 @@ def record_of(
     ]
     states = extracted.trajectory.select(extracted.names)
     at = mesh[2 * before :: 2]
-    slopes = [np.interp(at, run.time, d) for d in extracted.derivatives.T]
+    slopes = [np.interp(at, extracted.trajectory.time, d) for d in extracted.derivatives.T]
     return Record(
         step,
         before,

@@ -15,7 +15,7 @@ from dfsm.core.files import json_value
 from dfsm.core.types import Array
 from dfsm.core.version import __version__
 from dfsm.data.conversion import in_units_of
-from dfsm.data.derivatives import differentiate
+from dfsm.data.derivatives import differentiate, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.fit import fit
@@ -173,7 +173,8 @@ def _mean_nrmse(
 
 def _reference(run: Trajectory, settings: FitSettings) -> dict[str, Array]:
     run = with_computed(run, settings.hub_height, settings.features)
-    rates = differentiate(run, settings.states, settings.derivatives)
+    head = lead_in(run, settings.start, settings.derivatives)
+    rates = differentiate(head, settings.states, settings.derivatives)
     recorded = run.window(settings.start, settings.stop)
     extracted = rates.trajectory.window(settings.start, settings.stop)
     values = {n: recorded[n] if n in recorded else extracted[n] for n in rates.names}

@@ -16,7 +16,7 @@ from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.conversion import converted
-from dfsm.data.derivatives import differentiate
+from dfsm.data.derivatives import differentiate, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.completion import all_completed
@@ -142,9 +142,10 @@ def _compare(
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
-    rates = differentiate(run, s.specs, s.derivatives)
+    rates = differentiate(lead_in(run, window[0], s.derivatives), s.specs, s.derivatives)
     inside = rates.trajectory.window(*window)
-    rows = np.isin(rates.trajectory.time, inside.time)
+    rows = np.isin(run.time, inside.time)
+    measured = rates.derivatives[np.isin(rates.trajectory.time, inside.time)]
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
     usual = training_spreads(first)
@@ -171,7 +172,7 @@ def _compare(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
-            derivative_errors=_derivative_errors(first, predicted, rates.derivatives[rows]),
+            derivative_errors=_derivative_errors(first, predicted, measured),
             band=band,
             coverage=coverage,
         )
