@@ -95,6 +95,7 @@ def fit(
     from dfsm.config.fit import load_config
     from dfsm.fitting.fit import fit as run_fit
     from dfsm.models.model_folder import check_target, save
+    from dfsm.models.summary import lines_of
 
     check_target(output)
     with working(quiet):
@@ -110,7 +111,8 @@ def fit(
 
         print_json(json_value(dict(model.provenance.record)))
         return
-    say(lines(model.summary()), quiet)
+    # Its warnings have been shown.
+    say(lines("\n".join(lines_of(model, warnings=False))), quiet)
     seconds = sum(result.seconds.values())
     say(
         f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",

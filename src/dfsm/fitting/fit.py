@@ -28,7 +28,8 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
-from dfsm.fitting.gate import correct
+from dfsm.fitting.doubts import Doubts, doubts
+from dfsm.fitting.gate import correct, predict
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.passing import fit_passing, unexplained
@@ -37,12 +38,13 @@ from dfsm.fitting.rollout_samples import along_rollouts, with_latents
 from dfsm.fitting.samples import Samples, data_warnings, extract, select
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.stabilize import stabilise
+from dfsm.fitting.verdicts import Evidence, verdicts
 from dfsm.models.corrective import Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
-from dfsm.models.stability import destabilised
+from dfsm.models.stability import destabilised, growths, places
 from dfsm.refinement.refine import RefineSettings, refine
 from dfsm.simulation.simulate import Status, simulate
 
@@ -115,6 +117,9 @@ def fit(
         samples = extract(data, settings)
     with _timed(seconds, "linear fit"):
         f = _fit_derivatives(samples, settings)
+    with _timed(seconds, "doubts"):
+        inputs, targets = samples.linear_inputs, samples.derivatives
+        doubt = doubts(samples, f, targets - predict(f.model, samples, inputs, targets), settings)
     with _timed(seconds, "corrective functions"):
         later = refinement is not None and refinement.network > 0
         e = correct(samples, samples.linear_inputs, samples.derivatives, f, settings, later)
@@ -133,10 +138,19 @@ def fit(
     if settings.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     recorded = seen = samples
+    discarded: list[str] = []
     if refinement is not None:
         with _timed(seconds, "refinement"):
             window = {"start": settings.start, "stop": settings.stop}
-            model = refine(model, data, refinement, **window, seed=settings.seed).model
+            with hushed():  # told with the other warnings
+                refined = refine(model, data, refinement, **window, seed=settings.seed)
+            model = refined.model
+            if refined.improved:
+                doubt = replace(doubt, notes=(), outdated=True)
+            else:
+                discarded.append(refined.message)
+                account = {"message": refined.message, "improved": False}
+                model = replace(model, provenance=Provenance({"refinement": account}))
             recorded = with_latents(model, data, samples, settings)
             recorded = replace(recorded, terms=model.terms)
             seen = along_rollouts(model, data, recorded, settings)
@@ -156,9 +170,10 @@ def fit(
         else:
             more = unexplained(model, seen)
     with _timed(seconds, "checks"):
-        notes, checks = _check(model, recorded, data, settings)
+        notes, checks, judged = _check(model, recorded, data, settings, doubt)
         notes += more
-    notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
+    known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
+    notes = list(dict.fromkeys(known))
     checks = [*f.notes, *checks]
     nonlinear = None
     if settings.nonlinear_only and not isinstance(settings.corrective, NoCorrection):
@@ -170,11 +185,12 @@ def fit(
     for row, account in zip(outputs, passing, strict=False):
         row["passing"] = account["explained"]
         row["decision"] += f"; {account['text']}"
-    decisions = [*e.decisions, *outputs]
+    decisions = [*_with_coefficients(e.decisions, samples, f, doubt), *outputs]
     record = dict(model.provenance.record) | _record(
         data, settings, f, decisions, notes, checks, seconds
     )
-    for text in notes:
+    record |= judged
+    for text in (*discarded, *notes):
         warnings.warn(text, DfsmWarning, stacklevel=2)
     model = replace(model, provenance=Provenance(record))
     if nonlinear is not None:
@@ -310,11 +326,12 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
 
 
 def _check(
-    model: DFSM, samples: Samples, data: Dataset, settings: FitSettings
-) -> tuple[list[str], list[str]]:
+    model: DFSM, samples: Samples, data: Dataset, settings: FitSettings, doubt: Doubts
+) -> tuple[list[str], list[str], dict[str, Any]]:
     """Look for what would surprise a user: non-finite values, instability, leaking disturbances.
 
     Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
+    The last of what is returned are growths and verdicts, for the record.
     """
     notes = data_warnings(data, settings, samples)
     x, u, w, p = model.split(samples.inputs)
@@ -324,16 +341,24 @@ def _check(
             "the fitted model is not finite on its own training samples: fewer "
             "corrective.samples, or another corrective.kind, may cure it"
         )
-    unstable = [(s, v.real.max()) for s, v in model.eigenvalues() if v.real.max() > 0]
-    if unstable:
-        points = ", ".join(f"{s:.4g}" for s, _ in unstable)
-        where = f"{model.schedule} = {points}" if model.schedule else "its only point"
-        notes.append(
-            f"the linear fit is unstable at {where} (fastest growth "
-            f"{max(v for _, v in unstable):.3g} 1/s): right for an unstable system; for any "
-            "other set linear.margin, or expect rollouts to drift off"
+    columns = samples.signals.state_columns
+    errors = None if doubt.outdated else doubt.errors[:, columns]
+    longest = max(run.window(settings.start, settings.stop).duration for run in data)
+    growing = growths(model, longest, errors)
+    if unstable := [g for g in growing if g.unstable]:
+        what = "linear fit" if model.e is None else "model"
+        cure = (
+            "right for an unstable system; for any other set linear.margin, or expect rollouts to "
+            "drift off"
         )
-    some = [data[i] for i in np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int))]
+        if not doubt.cured_by_margin:
+            cure = "what is told of its inputs may be why, and is to be mended first"
+        notes.append(
+            f"the {what} is unstable at {places(unstable, model.schedule)} (fastest growth "
+            f"{max(g.rate for g in unstable):.3g} 1/s): {cure}"
+        )
+    tried = np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int)).tolist()
+    some = [data[i] for i in tried]
     with hushed():
         rollouts = simulate(model, some, start=settings.start, stop=settings.stop)
     done = sum(r.status is Status.COMPLETED for r in rollouts)
@@ -349,7 +374,17 @@ def _check(
         checks.append(outcome.account)
         if outcome.unexpected:
             notes.append(f"{outcome.account}, although {_unexpected(model)}")
-    return notes, checks
+    evidence = Evidence(
+        rollouts=dict(zip(tried, rollouts, strict=True)),
+        doubts=None if doubt.outdated else doubt,
+        growths=growing,
+        refined=doubt.outdated,
+    )
+    judged = {
+        "growth": [asdict(g) for g in growing],
+        "verdicts": verdicts(model, samples, settings, evidence),
+    }
+    return notes, checks, judged
 
 
 def _unexpected(model: DFSM) -> str:
@@ -363,6 +398,27 @@ def _unexpected(model: DFSM) -> str:
         "the linear fit is stable: right for a system with several equilibria; for any other set "
         "linear.margin, or correct less (gate, corrective)"
     )
+
+
+def _with_coefficients(
+    decisions: list[dict[str, Any]], samples: Samples, f: LinearFit, doubt: Doubts
+) -> list[dict[str, Any]]:
+    """The decisions on derivatives with the linear fit's mean coefficients and their errors."""
+    if doubt.outdated:
+        return decisions
+    names = samples.linear_names
+    return [
+        d
+        if np.isnan(errors).all()
+        else d
+        | {
+            "coefficients": [
+                (name, float(value), float(error) if np.isfinite(error) else None)
+                for name, value, error in zip(names, row, errors, strict=True)
+            ]
+        }
+        for d, row, errors in zip(decisions, f.mean_coefficients, doubt.errors, strict=True)
+    ]
 
 
 def _told(settings: FitSettings) -> list[dict[str, Any]]:

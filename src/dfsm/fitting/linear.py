@@ -138,6 +138,12 @@ class LinearFit:
     constant: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
+    @property
+    def mean_coefficients(self) -> Array:
+        """Coefficients over all samples, ``(target, input)``."""
+        share = self.samples / self.samples.sum()
+        return np.einsum("p,prc->rc", share, np.asarray(self.model.coefficients))
+
 
 def schedule_windows(schedule: Array, points: int) -> Array:
     """Overlapping windows of equal width over the range of a schedule, ends included.

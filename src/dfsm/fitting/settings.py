@@ -111,8 +111,10 @@ class FitSettings:
                     )
                 roles.setdefault(name, role)
         for feature in self.features:
+            # What acted before now is known; optimal control refuses it, see `acting_late`.
+            free: set[Role] = {_DISTURBANCE} | ({"control"} if feature.kind == "delay" else set())
             source = next(
-                (n for n in feature.sources if roles.get(n, _DISTURBANCE) != _DISTURBANCE), None
+                (n for n in feature.sources if roles.get(n, _DISTURBANCE) not in free), None
             )
             if source is not None:
                 raise DfsmError(
