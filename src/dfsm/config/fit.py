@@ -15,6 +15,7 @@ from dfsm.core.settings import require
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
 from dfsm.data.readers import read_all
+from dfsm.data.suspects import Suspects
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
@@ -43,12 +44,15 @@ class DataConfig(Strict):
         Time window in s; null leaves that end open.
     hub_height
         In m; adds the corrected rotor wind ``RtVAvgxhCorr`` to every run.
+    outliers
+        What to do with samples and runs that cannot belong to the rest, see `screened`.
     """
 
     train: list[str]
     start: float | None = None
     stop: float | None = None
     hub_height: float | None = None
+    outliers: Suspects = FitSettings.outliers
 
 
 class SignalConfig(Strict):
@@ -124,6 +128,7 @@ class Config(Strict):
             start=self.data.start,
             stop=self.data.stop,
             hub_height=self.data.hub_height,
+            outliers=self.data.outliers,
             derivatives=self.derivatives,
             linear=self.linear,
             terms=tuple(self._rooted(term) for term in self.terms),

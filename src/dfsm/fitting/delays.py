@@ -16,7 +16,7 @@ from dfsm.fitting.residuals import Residuals, stacked
 
 # A row is looked at where more than this is unexplained, and a delay told where it leaves at most
 # this share of the residual's variance.
-_UNEXPLAINED, _LEAVES = 0.1, 0.4
+_UNEXPLAINED, _LEAVES = 0.1, 0.25
 # Intervals below which chance explains as much, delays tried, and the longest relative to a run.
 _FEWEST, _TRIED, _LONGEST = 150, 40, 0.2
 
@@ -55,12 +55,13 @@ def late_input(residuals: Residuals, columns: range) -> LateInput | None:
         return None
     longest = _LONGEST * min(sizes)
     grid = np.unique(np.concatenate([[1.0], np.geomspace(1, max(longest, 1), _TRIED)]))
-    now, best = _left(residuals, None, 0.0), None
+    delayed = _Delayed(residuals)
+    now, best = delayed.left(), None
     for column in columns:
-        left = [_left(residuals, column, lag) for lag in grid]
+        left = [delayed.left(column, lag) for lag in grid]
         k = int(np.argmin(left))
         around = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 13)
-        finer = [_left(residuals, column, lag) for lag in around]
+        finer = [delayed.left(column, lag) for lag in around]
         lag, least = float(around[int(np.argmin(finer))]), min(finer)
         # At the end of the grid it is no delay that is sought, at its head no delay at all.
         inside = k < len(grid) - 1 and lag > 1
@@ -73,24 +74,36 @@ def late_input(residuals: Residuals, columns: range) -> LateInput | None:
     return LateInput(column, lag * residuals.step, float(np.sqrt(least)) / spread)
 
 
-def _left(residuals: Residuals, column: int | None, lag: float) -> float:
-    """Variance that a linear fit leaves with one input delayed by so many intervals."""
-    inputs = []
-    for run in residuals.inputs:
-        run = run.copy()
+class _Delayed:
+    """Variance that a linear fit leaves with one input delayed."""
+
+    def __init__(self, residuals: Residuals) -> None:
+        self.runs = residuals.inputs
+        X, y = stacked(residuals.inputs), stacked(residuals.targets)
+        X, y = X - X.mean(axis=0), y - y.mean()
+        self.table = np.column_stack([X, y])
+        self.gram = self.table.T @ self.table
+
+    def left(self, column: int | None = None, lag: float = 0.0) -> float:
+        """Variance left, the input in one column being so many intervals late."""
+        gram, n = self.gram, len(self.table)
         if column is not None:
-            at = np.arange(len(run))
-            run[:, column] = np.interp(at - lag, at, run[:, column])
-        inputs.append(run)
-    X, y = stacked(inputs), stacked(residuals.targets)
-    X, y = X - X.mean(axis=0), y - y.mean()
-    return _rest(X, y)
+            late = stacked([_shifted(run[:, column], lag) for run in self.runs])
+            late = late - late.mean()
+            products = self.table.T @ late
+            gram = gram.copy()
+            gram[column], gram[:, column] = products, products
+            gram[column, column] = late @ late
+        scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+        gram = gram / np.outer(scale, scale)
+        inner, right = gram[:-1, :-1], gram[:-1, -1]
+        share = 1 - right @ np.linalg.lstsq(inner, right, rcond=1e-12)[0]
+        return float(share * scale[-1] ** 2 / n)
 
 
-def _rest(X: Array, y: Array) -> float:
-    scale = np.maximum(X.std(axis=0), np.finfo(float).tiny)
-    gram, right = (X / scale).T @ (X / scale), (X / scale).T @ y
-    return float((y @ y - right @ np.linalg.lstsq(gram, right, rcond=1e-12)[0]) / len(y))
+def _shifted(values: Array, lag: float) -> Array:
+    at = np.arange(len(values))
+    return np.interp(at - lag, at, values)
 
 
 def late_note(row: str, name: str, late: LateInput, unexplained: float) -> str:

@@ -93,8 +93,9 @@ def _regressed(u: Array, inputs: Array) -> tuple[Array, float]:
     """Coefficients of least squares, and the sum of squares that they leave."""
     X = inputs - inputs.mean(axis=0)
     scale = np.maximum(X.std(axis=0), np.finfo(float).tiny)
-    solved = np.linalg.lstsq(X / scale, u, rcond=1e-10)[0]
-    return solved / scale, float(np.sum((u - X / scale @ solved) ** 2))
+    X /= scale
+    solved = np.linalg.lstsq(X.T @ X, X.T @ u, rcond=1e-12)[0]
+    return solved / scale, float(np.sum((u - X @ solved) ** 2))
 
 
 def _lagged(x: Array, lag: float) -> Array:

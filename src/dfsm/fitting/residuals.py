@@ -15,9 +15,9 @@ import numpy as np
 from dfsm.core.types import Array, IntArray
 from dfsm.numerics.least_squares import correlation_length
 
-# Intervals per correlation time of the residual, and the most of them in a run.
+# Intervals per correlation time of the residual, and the most of them in all runs together.
 _PER_CORRELATION = 10
-_MOST = 4000
+_MOST = 10_000
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ def residuals_of(
     parts = list(_split(runs))
     step = min(float(np.median(np.diff(time[part]))) for part in parts)
     memory = np.mean([_memory(time[part], left[part]) for part in parts])
-    longest = max(float(time[part][-1] - time[part][0]) for part in parts)
-    step = max(step, memory / _PER_CORRELATION, longest / _MOST)
+    together = sum(float(time[part][-1] - time[part][0]) for part in parts)
+    step = max(step, memory / _PER_CORRELATION, together / _MOST)
     table = np.column_stack([inputs, target, left])
     means = [m for part in parts if len(m := _means(time[part], table[part], step))]
     if sum(len(m) for m in means) < 4 * (inputs.shape[1] + 1):

@@ -8,6 +8,7 @@ from dataclasses import field
 from dfsm.core.settings import require, settings_class
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
+from dfsm.data.suspects import SUSPECTS, Suspects
 from dfsm.data.trajectory import Role
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
@@ -55,6 +56,9 @@ class FitSettings:
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
         Seed of everything random.
+    outliers
+        What to do with stray samples and runs in another unit: ``"refuse"``, ``"drop"`` or
+        ``"keep"``, see `dfsm.data.suspects.screened`.
     """
 
     states: tuple[StateSpec, ...]
@@ -74,8 +78,11 @@ class FitSettings:
     terms: tuple[TermSettings, ...] = ()
     nonlinear_only: bool = True
     seed: int = 0
+    outliers: Suspects = "refuse"
 
     def __post_init__(self) -> None:
+        known = f"one of {', '.join(SUSPECTS)}"
+        require(self.outliers in SUSPECTS, "outliers", self.outliers, known)
         require(self.gate >= 0, "gate", self.gate, "0 or more")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
 
