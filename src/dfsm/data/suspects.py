@@ -76,7 +76,7 @@ def screened(
             unit = run.channel(name).unit or "no unit"
             raise DfsmError(
                 f"{run.where}: '{name}' ({unit}) is {factor:.3g} times what it is in the other "
-                f"runs, in mean, spread and range ({word}), as if it were in another unit: {_ADVICE}"
+                f"runs, in mean, spread and range ({word}), as if in another unit: {_ADVICE}"
             )
         del kept[place]
     return kept

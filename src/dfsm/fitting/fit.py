@@ -26,7 +26,7 @@ from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.readers.rotor_table import RotorTable
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
-from dfsm.fitting.contraction import contraction
+from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
 from dfsm.fitting.gate import correct, predict
@@ -35,22 +35,16 @@ from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
-from dfsm.fitting.samples import Samples, data_warnings, extract, select
+from dfsm.fitting.samples import Samples, extract, select
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.stabilize import stabilise
-from dfsm.fitting.verdicts import Evidence, verdicts
 from dfsm.models.corrective import Corrective
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
-from dfsm.models.stability import destabilised, growths, places
+from dfsm.models.stability import destabilised
 from dfsm.refinement.refine import RefineSettings, refine
-from dfsm.simulation.simulate import Status, simulate
-
-# Training runs that are simulated to check a new model, and those of them along which pairs of
-# rollouts from different initial states are followed.
-_CHECK_RUNS, _PAIRED_RUNS = 8, 3
 
 
 @dataclass(frozen=True)
@@ -170,7 +164,7 @@ def fit(
         else:
             more = unexplained(model, seen)
     with _timed(seconds, "checks"):
-        notes, checks, judged = _check(model, recorded, data, settings, doubt)
+        notes, checks, judged = check(model, recorded, data, settings, doubt)
         notes += more
     known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
     notes = list(dict.fromkeys(known))
@@ -322,81 +316,6 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
         corrected=tuple(range(samples.derivatives.shape[1])),
         corrected_outputs=tuple(range(samples.outputs.shape[1])),
         signals=samples.signals,
-    )
-
-
-def _check(
-    model: DFSM, samples: Samples, data: Dataset, settings: FitSettings, doubt: Doubts
-) -> tuple[list[str], list[str], dict[str, Any]]:
-    """Look for what would surprise a user: non-finite values, instability, leaking disturbances.
-
-    Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
-    The last of what is returned are growths and verdicts, for the record.
-    """
-    notes = data_warnings(data, settings, samples)
-    x, u, w, p = model.split(samples.inputs)
-    values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
-    if not np.isfinite(values).all():
-        raise DfsmError(
-            "the fitted model is not finite on its own training samples: fewer "
-            "corrective.samples, or another corrective.kind, may cure it"
-        )
-    columns = samples.signals.state_columns
-    errors = None if doubt.outdated else doubt.errors[:, columns]
-    longest = max(run.window(settings.start, settings.stop).duration for run in data)
-    growing = growths(model, longest, errors)
-    if unstable := [g for g in growing if g.unstable]:
-        what = "linear fit" if model.e is None else "model"
-        cure = (
-            "right for an unstable system; for any other set linear.margin, or expect rollouts to "
-            "drift off"
-        )
-        if not doubt.cured_by_margin:
-            cure = "what is told of its inputs may be why, and is to be mended first"
-        notes.append(
-            f"the {what} is unstable at {places(unstable, model.schedule)} (fastest growth "
-            f"{max(g.rate for g in unstable):.3g} 1/s): {cure}"
-        )
-    tried = np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int)).tolist()
-    some = [data[i] for i in tried]
-    with hushed():
-        rollouts = simulate(model, some, start=settings.start, stop=settings.stop)
-    done = sum(r.status is Status.COMPLETED for r in rollouts)
-    checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]
-    if done < len(some):
-        worst = min(
-            (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended
-        )
-        notes.append(f"only {checks[0]}; {worst.trajectory.name}: {worst.reason}")
-    few = slice(None, None, -(-len(some) // _PAIRED_RUNS))
-    outcome = contraction(model, some[few], rollouts[few], settings.start, settings.stop)
-    if outcome is not None:
-        checks.append(outcome.account)
-        if outcome.unexpected:
-            notes.append(f"{outcome.account}, although {_unexpected(model)}")
-    evidence = Evidence(
-        rollouts=dict(zip(tried, rollouts, strict=True)),
-        doubts=None if doubt.outdated else doubt,
-        growths=growing,
-        refined=doubt.outdated,
-    )
-    judged = {
-        "growth": [asdict(g) for g in growing],
-        "verdicts": verdicts(model, samples, settings, evidence),
-    }
-    return notes, checks, judged
-
-
-def _unexpected(model: DFSM) -> str:
-    """What ought to have made states come together, and what to do where it did not."""
-    if model.schedule:
-        return (
-            f"every linear fit is stable with {model.schedule} frozen: as it moves, the model is "
-            "not; use fewer linear.points, a larger linear.margin or another linear.schedule"
-        )
-    return (
-        "the linear fit is stable: right for a system with several equilibria; for any other set "
-        "linear.margin, or correct less (gate, corrective)"
     )
 
 

@@ -1,4 +1,4 @@
-"""A verdict on every channel in words: usable, for trends only, or not usable, why, and what to try.
+"""A verdict on every channel in words: usable, for trends only, not usable; why, and what to try.
 
 A user wants to know what a model is good for, not what its residuals are. Rollouts over recorded
 runs answer that: their error relative to what the channel does there.
@@ -16,7 +16,6 @@ from dfsm.core.types import Array
 from dfsm.fitting.doubts import Doubts
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
-from dfsm.models.dfsm import DFSM
 from dfsm.models.stability import Growth
 from dfsm.simulation.simulate import Simulation, Status
 
@@ -56,15 +55,11 @@ class Evidence:
     refined: bool
 
 
-def verdicts(
-    model: DFSM, samples: Samples, settings: FitSettings, evidence: Evidence
-) -> list[dict[str, Any]]:
+def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> list[dict[str, Any]]:
     """Judge measured states and outputs by rollouts.
 
     Parameters
     ----------
-    model
-        The whole one.
     samples
         With the recorded states and outputs.
     settings
@@ -97,7 +92,7 @@ def verdicts(
             why = f"rollouts over {runs} are off by {error:.2g} of its standard deviation"
         text = f"{verdict}: {why}"
         if verdict != "usable":
-            reason, advice = _advice(name, model, settings, evidence)
+            reason, advice = _advice(name, settings, evidence)
             text = f"{verdict}, because {why}{reason}; try {advice}"
         entries.append({"name": name, "nrmse": error, "verdict": verdict, "text": text})
     return entries
@@ -118,7 +113,7 @@ def _error(name: str, values: Array, samples: Samples, rollouts: Mapping[int, Si
     return float(np.mean(errors)) if errors else float("nan")
 
 
-def _advice(name: str, model: DFSM, settings: FitSettings, evidence: Evidence) -> tuple[str, str]:
+def _advice(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, str]:
     """Why, as far as anything tells, and what to try first."""
     d = evidence.doubts
     if d is not None and d.biased:

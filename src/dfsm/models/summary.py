@@ -1,4 +1,4 @@
-"""A model in lines of text: signals, what the fit decided and why, stability, verdicts, warnings."""
+"""A model in lines of text: signals, what the fit decided, stability, verdicts, warnings."""
 
 from __future__ import annotations
 
