@@ -23,7 +23,7 @@ from dfsm.fitting.standard_errors import standard_errors
 
 # A coefficient matters where its input makes so much of a row, and is not known where it is less
 # than so many standard errors.
-_MATTERS, _KNOWN = 0.2, 2.0
+_MATTERS, _KNOWN = 0.2, 1.0
 
 
 @dataclass(frozen=True)
@@ -76,21 +76,22 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
     notes: list[str] = []
     biased, late = [], []
     laws: dict[int, Law] = {}
-    names = samples.linear_names
+    names, driving = samples.linear_names, len(samples.signals.driving)
     for row in (r for r in range(len(mean)) if r not in kinematic):
         name, target = samples.derivative_names[row][0], samples.derivatives[:, row]
         errors[row] = standard_errors(inputs, left[:, row], samples.runs)
         held = {column for r, column in fit.model.known if r == row}
         errors[row, list(held)] = 0.0
-        notes += _unknown(name, names, mean[row], errors[row], inputs, target, fit.condition)
         notes += _noise(name, samples, inputs, target, mean[row])
         series = residuals_of(samples.time, samples.runs, inputs, target, left[:, row])
-        if series is None:
-            continue
-        if note := _feedback(name, samples, series, mean, row, held, laws):
+        note = None if series is None else _feedback(name, samples, series, mean, row, held, laws)
+        if note:
             notes.append(note)
             biased.append(name)
-        elif found := late_input(series, range(len(samples.signals.driving))):
+            continue
+        if not fit.moved:  # for a margin it is no longer the best fit
+            notes += _unknown(name, names, mean[row], errors[row], inputs, target, fit.condition)
+        if series is not None and (found := late_input(series, range(driving))):
             notes.append(late_note(name, names[found.column], found, series.unexplained))
             late.append(name)
     return Doubts(tuple(notes), errors, tuple(biased), tuple(late))
@@ -153,8 +154,8 @@ def _unknown(
         f"{names[i]} ({row[i]:.3g} ± {errors[i]:.2g})" for i in np.flatnonzero(matters)
     )
     return [
-        f"{name}: half the effect or more may be chance in {told}, standard errors from the "
-        "correlation of what is left over: give longer or more runs, or set linear.known"
+        f"{name}: effects that are no larger than their standard errors, {told}, may be chance "
+        "(from the correlation of what is left over): give longer or more runs, or linear.known"
     ]
 
 

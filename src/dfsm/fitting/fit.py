@@ -211,9 +211,8 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
             result, columns, kinematic, settings.linear.margin, settings.linear.affine, slopes
         )
         names = [samples.derivative_names[i][0] for i in fitted]
-        result = replace(
-            result, notes=_account(settings, moved, names, before, result.residual_rms)
-        )
+        account = _account(settings, moved, names, before, result.residual_rms)
+        result = replace(result, notes=account, moved=tuple(moved))
     points, _, n_inputs = result.model.coefficients.shape
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])

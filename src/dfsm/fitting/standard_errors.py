@@ -19,6 +19,8 @@ from dfsm.core.types import Array, IntArray
 from dfsm.numerics.least_squares import correlation_length
 
 _PER_MEMORY = 10
+# A derivative out of a spline draws on about so many samples.
+_STENCIL = 4.0
 
 
 def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
@@ -51,7 +53,7 @@ def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
     variance, independent = np.zeros(g.shape[1]), 0.0
     for start, stop in zip([0, *ends[:-1]], ends, strict=True):
         remembers = float(correlation_length(left[start:stop, None])[0])
-        independent += (stop - start) / remembers
+        independent += (stop - start) / max(remembers, _STENCIL)
         # Sums over much less than the residual remembers do not change how sums vary.
         places = np.arange(0, stop - start, max(1, int(remembers / _PER_MEMORY)))
         products = np.add.reduceat(g[start:stop] * left[start:stop, None], places, axis=0)
