@@ -60,9 +60,9 @@ gate: 0.01            # correct a row only if its residual exceeds this share of
 azimuth: {azimuth}
 nonlinear_only: {nonlinear_only}  # also fit the nonlinear-only model, for comparison in the report
 # Refine the derivative fit on rollouts over the training runs (null is a whole run), with latent
-# states that remember the inputs. It is where most accuracy is to be had and most time goes: it grows
-# with states, linear.points and runs, minutes for two states and one turbine's runs, and ends at the
-# latest with the step that is at work after so many seconds, for instance
+# states that remember the inputs. Most accuracy and most time are here: it grows with
+# states, linear.points and runs, from minutes for two states of a turbine on; no further step is
+# begun after so many seconds, for instance
 # refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8, network: 16, decay: 3,
 #          seconds: 600}}
 refine: {refine}
