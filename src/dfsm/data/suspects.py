@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 
@@ -104,7 +104,7 @@ def _without_strays(run: Trajectory, names: Sequence[str], what: Suspects) -> Tr
     return run if values is None else replace(run, values=values)
 
 
-def _strays(samples: Array) -> Array:
+def _strays(samples: Array) -> IntArray:
     """Rows of the samples that are huge, or a few that are far from all others."""
     finite = np.isfinite(samples)
     huge = np.flatnonzero(finite & (np.abs(np.where(finite, samples, 0.0)) > _HUGE))

@@ -144,14 +144,14 @@ def _unknown(
     if not matters.any():
         return []
     if not np.isfinite(errors[matters]).all():
-        which = ", ".join(names[i] for i in np.flatnonzero(matters))
+        which = ", ".join(names[i] for i in np.flatnonzero(matters).tolist())
         return [
             f"{name}: the runs hold fewer independent samples than the fit has coefficients, so "
             f"nothing is known of the effects of {which}, however small the residual: give longer "
             "or more runs"
         ]
     told = ", ".join(
-        f"{names[i]} ({row[i]:.3g} ± {errors[i]:.2g})" for i in np.flatnonzero(matters)
+        f"{names[i]} ({row[i]:.3g} ± {errors[i]:.2g})" for i in np.flatnonzero(matters).tolist()
     )
     return [
         f"{name}: effects that are no larger than their standard errors, {told}, may be chance "

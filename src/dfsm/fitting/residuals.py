@@ -73,7 +73,7 @@ def residuals_of(
     """
     parts = list(_split(runs))
     step = min(float(np.median(np.diff(time[part]))) for part in parts)
-    memory = np.mean([_memory(time[part], left[part]) for part in parts])
+    memory = float(np.mean([_memory(time[part], left[part]) for part in parts]))
     together = sum(float(time[part][-1] - time[part][0]) for part in parts)
     step = max(step, memory / _PER_CORRELATION, together / _MOST)
     table = np.column_stack([inputs, target, left])
