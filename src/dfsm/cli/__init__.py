@@ -121,6 +121,7 @@ def fit(
     from dfsm.core.lock import locked
     from dfsm.fitting.fit import fit as run_fit
     from dfsm.models.model_folder import check_target, save
+    from dfsm.models.summary import lines_of
 
     check_target(output)
     with locked(output):
@@ -138,7 +139,8 @@ def fit(
 
         print_json(json_value(dict(model.provenance.record)))
         return
-    say(lines(model.summary()), quiet)
+    # Its warnings have been shown.
+    say(lines("\n".join(lines_of(model, warnings=False))), quiet)
     seconds = sum(result.seconds.values())
     say(
         f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",

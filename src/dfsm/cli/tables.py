@@ -185,11 +185,12 @@ def print_ranking(ranking: Ranking) -> None:
         costs = [f"{of - o.diverged} of {of}", str(o.parameters)]
         costs += [f"{o.fit_seconds:.1f} s", f"{1000 * o.simulate_seconds:.0f} ms"]
         costs = ["–"] * len(costs) if c.status == "failed" else costs
-        table.add_row(_text(c.name), *figures, *costs, _text(c.changes))
+        changes = f"{c.changes} (refinement discarded)" if o.discarded else c.changes
+        table.add_row(_text(c.name), *figures, *costs, _text(changes))
     console.print(table)
     states = ", ".join(ranking.states)
     console.print(_text(f"score: root mean square over {states} of the NRMSE of rollouts"))
-    for text in ranking.failures():
+    for text in (*ranking.failures(), *ranking.discarded()):
         console.print(_text(text))
     kept = [c.name for c in ranking.candidates if c.kept]
     if kept:

@@ -17,6 +17,7 @@ from dfsm.data.features import Feature
 from dfsm.data.parameters import Table, names_in, read_parameters, with_parameters
 from dfsm.data.readers import read_all
 from dfsm.data.slower import Slower
+from dfsm.data.suspects import Suspects
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
@@ -53,6 +54,8 @@ class DataConfig(Strict):
         Interval between samples in s of files that hold no time.
     slower
         What channels with fewer samples than their table do in between: hold or linear, or by name.
+    outliers
+        What to do with samples and runs that cannot belong to the rest, see `screened`.
     """
 
     train: list[str]
@@ -61,6 +64,7 @@ class DataConfig(Strict):
     hub_height: float | None = None
     step: float | None = None
     slower: Slower = None
+    outliers: Suspects = FitSettings.outliers
 
 
 class SignalConfig(Strict):
@@ -160,6 +164,7 @@ class Config(Strict):
             stop=self.data.stop,
             hub_height=self.data.hub_height,
             slower=self.data.slower,
+            outliers=self.data.outliers,
             derivatives=self.derivatives,
             linear=self.linear,
             terms=tuple(self._rooted(term) for term in self.terms),

@@ -26,15 +26,16 @@ from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.readers.rotor_table import RotorTable
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
-from dfsm.fitting.contraction import contraction
+from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
-from dfsm.fitting.gate import correct
+from dfsm.fitting.doubts import Doubts, doubts
+from dfsm.fitting.gate import correct, predict
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
-from dfsm.fitting.samples import Samples, data_warnings, extract, select
+from dfsm.fitting.samples import Samples, extract, select
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.stabilize import stabilise
 from dfsm.models.corrective import Corrective
@@ -44,11 +45,6 @@ from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
 from dfsm.models.stability import destabilised
 from dfsm.refinement.refine import RefineSettings, refine
-from dfsm.simulation.simulate import Status, simulate
-
-# Training runs that are simulated to check a new model, and those of them along which pairs of
-# rollouts from different initial states are followed.
-_CHECK_RUNS, _PAIRED_RUNS = 8, 3
 
 
 @dataclass(frozen=True)
@@ -115,6 +111,9 @@ def fit(
         samples = extract(data, settings)
     with _timed(seconds, "linear fit"):
         f = _fit_derivatives(samples, settings)
+    with _timed(seconds, "doubts"):
+        inputs, targets = samples.linear_inputs, samples.derivatives
+        doubt = doubts(samples, f, targets - predict(f.model, samples, inputs, targets), settings)
     with _timed(seconds, "corrective functions"):
         later = refinement is not None and refinement.network > 0
         e = correct(samples, samples.linear_inputs, samples.derivatives, f, settings, later)
@@ -133,10 +132,19 @@ def fit(
     if settings.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     recorded = seen = samples
+    discarded: list[str] = []
     if refinement is not None:
         with _timed(seconds, "refinement"):
             window = {"start": settings.start, "stop": settings.stop}
-            model = refine(model, data, refinement, **window, seed=settings.seed).model
+            with hushed():  # told with the other warnings
+                refined = refine(model, data, refinement, **window, seed=settings.seed)
+            model = refined.model
+            if refined.improved:
+                doubt = replace(doubt, notes=(), outdated=True)
+            else:
+                discarded.append(refined.message)
+                account = {"message": refined.message, "improved": False}
+                model = replace(model, provenance=Provenance({"refinement": account}))
             recorded = with_latents(model, data, samples, settings)
             recorded = replace(recorded, terms=model.terms)
             seen = along_rollouts(model, data, recorded, settings)
@@ -156,9 +164,10 @@ def fit(
         else:
             more = unexplained(model, seen)
     with _timed(seconds, "checks"):
-        notes, checks = _check(model, recorded, data, settings)
+        notes, checks, judged = check(model, recorded, data, settings, doubt)
         notes += more
-    notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
+    known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
+    notes = list(dict.fromkeys(known))
     checks = [*f.notes, *checks]
     nonlinear = None
     if settings.nonlinear_only and not isinstance(settings.corrective, NoCorrection):
@@ -170,11 +179,12 @@ def fit(
     for row, account in zip(outputs, passing, strict=False):
         row["passing"] = account["explained"]
         row["decision"] += f"; {account['text']}"
-    decisions = [*e.decisions, *outputs]
+    decisions = [*_with_coefficients(e.decisions, samples, f, doubt), *outputs]
     record = dict(model.provenance.record) | _record(
         data, settings, f, decisions, notes, checks, seconds
     )
-    for text in notes:
+    record |= judged
+    for text in (*discarded, *notes):
         warnings.warn(text, DfsmWarning, stacklevel=2)
     model = replace(model, provenance=Provenance(record))
     if nonlinear is not None:
@@ -201,9 +211,8 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
             result, columns, kinematic, settings.linear.margin, settings.linear.affine, slopes
         )
         names = [samples.derivative_names[i][0] for i in fitted]
-        result = replace(
-            result, notes=_account(settings, moved, names, before, result.residual_rms)
-        )
+        account = _account(settings, moved, names, before, result.residual_rms)
+        result = replace(result, notes=account, moved=tuple(moved))
     points, _, n_inputs = result.model.coefficients.shape
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])
@@ -309,60 +318,25 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
     )
 
 
-def _check(
-    model: DFSM, samples: Samples, data: Dataset, settings: FitSettings
-) -> tuple[list[str], list[str]]:
-    """Look for what would surprise a user: non-finite values, instability, leaking disturbances.
-
-    Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
-    """
-    notes = data_warnings(data, settings, samples)
-    x, u, w, p = model.split(samples.inputs)
-    values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
-    if not np.isfinite(values).all():
-        raise DfsmError(
-            "the fitted model is not finite on its own training samples: fewer "
-            "corrective.samples, or another corrective.kind, may cure it"
-        )
-    unstable = [(s, v.real.max()) for s, v in model.eigenvalues() if v.real.max() > 0]
-    if unstable:
-        points = ", ".join(f"{s:.4g}" for s, _ in unstable)
-        where = f"{model.schedule} = {points}" if model.schedule else "its only point"
-        notes.append(
-            f"the linear fit is unstable at {where} (fastest growth "
-            f"{max(v for _, v in unstable):.3g} 1/s): right for an unstable system; for any "
-            "other set linear.margin, or expect rollouts to drift off"
-        )
-    some = [data[i] for i in np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int))]
-    with hushed():
-        rollouts = simulate(model, some, start=settings.start, stop=settings.stop)
-    done = sum(r.status is Status.COMPLETED for r in rollouts)
-    checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]
-    if done < len(some):
-        worst = min(
-            (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended
-        )
-        notes.append(f"only {checks[0]}; {worst.trajectory.name}: {worst.reason}")
-    few = slice(None, None, -(-len(some) // _PAIRED_RUNS))
-    outcome = contraction(model, some[few], rollouts[few], settings.start, settings.stop)
-    if outcome is not None:
-        checks.append(outcome.account)
-        if outcome.unexpected:
-            notes.append(f"{outcome.account}, although {_unexpected(model)}")
-    return notes, checks
-
-
-def _unexpected(model: DFSM) -> str:
-    """What ought to have made states come together, and what to do where it did not."""
-    if model.schedule:
-        return (
-            f"every linear fit is stable with {model.schedule} frozen: as it moves, the model is "
-            "not; use fewer linear.points, a larger linear.margin or another linear.schedule"
-        )
-    return (
-        "the linear fit is stable: right for a system with several equilibria; for any other set "
-        "linear.margin, or correct less (gate, corrective)"
-    )
+def _with_coefficients(
+    decisions: list[dict[str, Any]], samples: Samples, f: LinearFit, doubt: Doubts
+) -> list[dict[str, Any]]:
+    """The decisions on derivatives with the linear fit's mean coefficients and their errors."""
+    if doubt.outdated:
+        return decisions
+    names = samples.linear_names
+    return [
+        d
+        if np.isnan(errors).all()
+        else d
+        | {
+            "coefficients": [
+                (name, float(value), float(error) if np.isfinite(error) else None)
+                for name, value, error in zip(names, row, errors, strict=True)
+            ]
+        }
+        for d, row, errors in zip(decisions, f.mean_coefficients, doubt.errors, strict=True)
+    ]
 
 
 def _told(settings: FitSettings) -> list[dict[str, Any]]:

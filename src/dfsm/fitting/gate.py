@@ -81,7 +81,7 @@ def correct(
     -------
     Correction
     """
-    residuals = targets - _predict(linear.model, samples, inputs, targets)
+    residuals = targets - predict(linear.model, samples, inputs, targets)
     rms, std = np.sqrt(np.mean(residuals**2, axis=0)), targets.std(axis=0)
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     derivatives = targets is samples.derivatives
@@ -150,8 +150,8 @@ def _train(
     return fit_corrective(seen, residuals, runs, settings.corrective, settings.seed)
 
 
-def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
-    """Evaluate the linear fit run by run, so that memory stays bounded."""
+def predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """The linear fit of some targets ``(sample, target)``, run by run to bound memory."""
     parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
     return np.concatenate([np.asarray(p) for p in parts])
 

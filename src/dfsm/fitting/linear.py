@@ -125,6 +125,8 @@ class LinearFit:
         Sentences that name inputs which do not vary or which the data cannot tell apart.
     notes
         What was done to the fit afterwards, and what it cost.
+    moved
+        Schedule points at which eigenvalues were moved: no fit of least squares any more.
     """
 
     model: LinearModel
@@ -137,6 +139,13 @@ class LinearFit:
     warnings: tuple[str, ...]
     constant: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+    moved: tuple[float, ...] = ()
+
+    @property
+    def mean_coefficients(self) -> Array:
+        """Coefficients over all samples, ``(target, input)``."""
+        share = self.samples / self.samples.sum()
+        return np.einsum("p,prc->rc", share, np.asarray(self.model.coefficients))
 
 
 def schedule_windows(schedule: Array, points: int) -> Array:

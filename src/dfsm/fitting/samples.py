@@ -20,6 +20,7 @@ from dfsm.data.derivatives import (
 )
 from dfsm.data.info import gap_warning
 from dfsm.data.slower import fill_slower
+from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
@@ -125,6 +126,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = [fill_slower(r, settings.slower) for r in runs]
+    runs = screened(list(runs), names, settings.outliers, (settings.start, settings.stop))
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
         names.update(dict.fromkeys(settings.azimuth.field))
@@ -155,6 +157,12 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     """What a user should know about the data before trusting a fit, one sentence each."""
     doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
     warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
+    for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
+        if values.min() == values.max():
+            warnings.append(
+                f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
+                "model: leave it out, or add runs in which it varies"
+            )
     gaps = [
         f"{run.where}: {text}"
         for run in data

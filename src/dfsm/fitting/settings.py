@@ -9,6 +9,7 @@ from dfsm.core.settings import require, settings_class
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
 from dfsm.data.slower import Slower
+from dfsm.data.suspects import SUSPECTS, Suspects
 from dfsm.data.trajectory import Role
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
@@ -58,6 +59,9 @@ class FitSettings:
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
         Seed of everything random.
+    outliers
+        What to do with stray samples and runs in another unit: ``"refuse"``, ``"drop"`` or
+        ``"keep"``, see `dfsm.data.suspects.screened`.
     """
 
     states: tuple[StateSpec, ...]
@@ -78,8 +82,11 @@ class FitSettings:
     terms: tuple[TermSettings, ...] = ()
     nonlinear_only: bool = True
     seed: int = 0
+    outliers: Suspects = "refuse"
 
     def __post_init__(self) -> None:
+        known = f"one of {', '.join(SUSPECTS)}"
+        require(self.outliers in SUSPECTS, "outliers", self.outliers, known)
         require(self.gate >= 0, "gate", self.gate, "0 or more")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
 
@@ -115,8 +122,10 @@ class FitSettings:
                     )
                 roles.setdefault(name, role)
         for feature in self.features:
+            # What acted before now is known; optimal control refuses it, see `acting_late`.
+            free: set[Role] = {_DISTURBANCE} | ({"control"} if feature.kind == "delay" else set())
             source = next(
-                (n for n in feature.sources if roles.get(n, _DISTURBANCE) != _DISTURBANCE), None
+                (n for n in feature.sources if roles.get(n, _DISTURBANCE) not in free), None
             )
             if source is not None:
                 raise DfsmError(

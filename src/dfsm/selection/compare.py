@@ -118,6 +118,14 @@ class Ranking:
         failed = [c for c in self.candidates if c.status == "failed"]
         return [f"candidate {c.name} could not be fitted: {c.outcome.message}" for c in failed]
 
+    def discarded(self) -> list[str]:
+        """One sentence per candidate that is not what was asked for: its refinement failed."""
+        return [
+            f"candidate {c.name} is not refined: {c.outcome.discarded}"
+            for c in self.candidates
+            if c.outcome.discarded
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values of all figures."""
         entries = [

@@ -117,6 +117,8 @@ class Outcome:
         Number of coefficients of the derivative function.
     warnings
         What the fit warned of.
+    discarded
+        Why a refinement was not taken over; empty where it was, or none was asked for.
     """
 
     message: str = ""
@@ -126,6 +128,7 @@ class Outcome:
     simulate_seconds: float = 0.0
     parameters: int = 0
     warnings: tuple[str, ...] = ()
+    discarded: str = ""
 
 
 def try_out(course: Course, candidate: Candidate) -> tuple[Outcome, DFSM | None]:
@@ -141,7 +144,10 @@ def try_out(course: Course, candidate: Candidate) -> tuple[Outcome, DFSM | None]
         return Outcome(message=str(error)), None
     notes = tuple(str(w.message) for w in caught if issubclass(w.category, DfsmWarning))
     seconds = sum(result.seconds.values())
-    return replace(outcome, fit_seconds=seconds, warnings=notes), result.model
+    refinement = result.model.provenance.record.get("refinement", {})
+    discarded = "" if refinement.get("improved", True) else refinement["message"]
+    outcome = replace(outcome, fit_seconds=seconds, warnings=notes, discarded=discarded)
+    return outcome, result.model
 
 
 def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
