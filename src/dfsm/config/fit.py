@@ -12,6 +12,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 
 from dfsm.config.parse import Strict, explain, load_yaml, parse_file
 from dfsm.core.settings import require
+from dfsm.data.between import Between
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
 from dfsm.data.readers import read_all
@@ -100,6 +101,7 @@ class Config(Strict):
     corrective: Annotated[CorrectiveSettings, Field(discriminator="kind")] = MLP()
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
+    inputs: Between | dict[str, Between] | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
     refine: RefineSettings | None = None
     seed: int = FitSettings.seed
@@ -130,6 +132,7 @@ class Config(Strict):
             corrective=self.corrective,
             gate=self.gate,
             azimuth=self.azimuth,
+            inputs=self.inputs,
             nonlinear_only=self.nonlinear_only,
             seed=self.seed,
         )

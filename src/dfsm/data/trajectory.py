@@ -108,6 +108,7 @@ class Trajectory:
             )
         if len(time) < 2:
             raise DfsmError(f"{self.where}: {len(time)} samples, at least 2 are needed")
+        time = _apart(time, values)
         _check_time(time, self.where)
         counts: dict[str, int] = {}
         for c in self.channels:
@@ -363,6 +364,22 @@ class Trajectory:
             raise DfsmError(f"{where}: the index is not time in s; set it to the time") from None
         channels = tuple(Channel(str(c), known.get(str(c), "")) for c in frame.columns)
         return cls(time, np.stack(columns, axis=1), channels, name=name, source=source)
+
+
+def _apart(time: Array, values: Array) -> Array:
+    """Move the second of two samples at one time on by the smallest step there is.
+
+    An event is written as two samples, before and after inputs jump; what does not jump is the same
+    in both. Two samples that have nothing in common, three at one time, or copies of samples in a
+    run without events are something else.
+    """
+    rows = np.flatnonzero(np.diff(time) == 0) + 1
+    same = values[rows] == values[rows - 1]
+    if same.all():
+        return time
+    pairs = rows[(np.diff(rows, prepend=-2) > 1) & same.any(axis=1)]
+    time[pairs] = np.nextafter(time[pairs], np.inf)
+    return time
 
 
 def _check_time(time: Array, where: str) -> None:

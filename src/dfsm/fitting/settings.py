@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import field
 
 from dfsm.core.settings import require, settings_class
+from dfsm.data.between import Chosen, resolved
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
 from dfsm.data.trajectory import Role
@@ -51,6 +52,10 @@ class FitSettings:
         runs that only have ``RtVAvgxh``.
     features
         Disturbances that are computed from others, see `Feature`; they follow those named.
+    inputs
+        What controls and disturbances do between samples: ``"hold"``, ``"linear"`` or ``"cubic"``,
+        for all or by name. Those not named are held where they stay and jump in the training data,
+        else joined by lines.
     nonlinear_only
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
@@ -72,6 +77,7 @@ class FitSettings:
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()
     terms: tuple[TermSettings, ...] = ()
+    inputs: Chosen = field(default=None, hash=False)
     nonlinear_only: bool = True
     seed: int = 0
 
@@ -110,6 +116,7 @@ class FitSettings:
                         f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
                     )
                 roles.setdefault(name, role)
+        _ = resolved(self.inputs, (*self.controls, *self.driving))
         for feature in self.features:
             source = next(
                 (n for n in feature.sources if roles.get(n, _DISTURBANCE) != _DISTURBANCE), None
