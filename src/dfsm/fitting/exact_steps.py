@@ -141,7 +141,7 @@ class Steps:
         n, count = driving, len(self.begin)
         sides = zip((self.begin, self.end), self.ends, strict=True)
         inputs = np.concatenate([np.hstack([v[:, :n], x, v[:, n:]]) for v, x in sides])
-        both = slopes(inputs)
+        both = np.array(slopes(inputs))
         begin, end = both[:count], both[count:]
         states, h = self.states.copy(), self.steps[:, 0]
         inner = self.open

@@ -18,8 +18,10 @@ from dfsm.core.types import IntArray
 from dfsm.numerics.smoothing import checked
 from dfsm.numerics.time_mesh import same_instant
 
-# Samples of a piece that tell its derivatives by themselves.
-_LONG = 20
+# Samples of a piece that tell its derivatives by themselves: where there are samples before and after
+# each jump, as many as a smoothing spline needs. Elsewhere, means over intervals are nearer to the
+# truth until noise covers them: measured on oscillators with 0.01 to 0.1 % of noise.
+_LONG, _LONG_WITHOUT = 20, 200
 
 # Values, first and second derivative of samples on a mesh, and the noise where it is known.
 Estimate = tuple[Series, Series, Series, float | None]
@@ -74,13 +76,15 @@ def piecewise(
     checked(t, y)
     borders = np.unique(of[breaks])
     borders = borders[(borders > 0) & (borders < len(t) - 1)]
+    written_twice = np.isin(borders, of[:-1][of[:-1] == of[1:]]).all()
+    least = (_LONG if written_twice else _LONG_WITHOUT) if len(borders) else 0
     rough = np.gradient(y, t)
     start = np.stack([y, rough, np.gradient(rough, t)])
     before, after = start.copy(), start.copy()
     told_before, told_after = np.zeros(len(t), bool), np.zeros(len(t), bool)
     noise: list[float] = []
     for a, b in pairwise([0, *borders, len(t) - 1]):
-        if b + 1 - a < (_LONG if len(borders) else 0):
+        if b + 1 - a < least:
             continue
         *parts, std = estimate(t[a : b + 1], y[a : b + 1])
         noise += [] if std is None else [std]

@@ -9,7 +9,7 @@ import enum
 import time as clock
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args, overload
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
+from dfsm.data.between import Between, Chosen
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
@@ -66,14 +67,16 @@ class SimulationSettings:
     rtol, atol
         Tolerances of the adaptive methods; `atol` is relative to each state's training spread.
     interpolation
-        Inputs between samples: ``"linear"`` or ``"cubic"`` spline.
+        Inputs between samples: ``"hold"``, ``"linear"`` or ``"cubic"`` spline, for all or by name;
+        None does as the model does. A wind field, which drives outputs alone, is joined by lines
+        unless all are splines.
     """
 
     method: Method = "rk4"
     step: float | None = None
     rtol: float = 1e-6
     atol: float = 1e-8
-    interpolation: Literal["linear", "cubic"] = "linear"
+    interpolation: Chosen = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
         if self.step is not None and not self.step > 0:
@@ -222,6 +225,9 @@ def simulate(
         require_constant(run, model.signals.names("parameters"))
     starts = None if initial is None else _starts(model, initial, len(batch))
 
+    between = model.signals.between_samples(settings.interpolation)
+    beside: Between = "cubic" if settings.interpolation == "cubic" else "linear"
+
     def case(i: int, drive: Drive, field: Array) -> Case[Drive]:
         begins = float(driven[i].time[0])
         x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
@@ -231,10 +237,10 @@ def simulate(
 
     def marched(i: int) -> Case[Mesh]:
         mesh = mesh_of(driven[i], settings.step, between)
-        return case(i, mesh, at_steps(fields[i], mesh, between))
+        return case(i, mesh, at_steps(fields[i], mesh, beside))
 
     begin = clock.perf_counter()
-    each, between = range(len(batch)), settings.interpolation
+    each = range(len(batch))
     if settings.method == "rk4":
         solved = march(model, (marched(i) for i in each))
     else:
