@@ -10,6 +10,7 @@ import io
 import os
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +19,20 @@ import typer
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
-from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
+from dfsm.cli.terminal import (
+    AsJson,
+    Files,
+    Interpolation,
+    Method,
+    Quiet,
+    Step,
+    fit_start,
+    lines,
+    marching,
+    print_json,
+    say,
+    working,
+)
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
@@ -88,18 +102,31 @@ def init(
 def fit(
     config: Annotated[Path, typer.Argument(help="Configuration made by dfsm init.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Model folder to write.")],
+    interpolation: Annotated[
+        str | None,
+        typer.Option(
+            help="Inputs between samples, before those of the configuration: hold, linear or "
+            "cubic, or by name, u=hold,w=cubic."
+        ),
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit a multi-fidelity model and save it as a folder."""
     from dfsm.config.fit import load_config
+    from dfsm.data.between import combined, parse_chosen
     from dfsm.fitting.fit import fit as run_fit
     from dfsm.models.model_folder import check_target, save
 
     check_target(output)
+    chosen = parse_chosen(interpolation)
     with working(quiet):
         settings, runs = load_config(config)
-        result = run_fit(runs, settings.fit_settings(), settings.refine)
+        choices = settings.fit_settings()
+        if chosen is not None:
+            names = (*choices.controls, *choices.driving)
+            choices = replace(choices, inputs=combined(chosen, choices.inputs, names))
+        result = run_fit(runs, choices, settings.refine)
         model = result.model
     replaced = output.exists() and any(output.iterdir())
     save(model, output, result.nonlinear)
@@ -182,6 +209,9 @@ def validate(
         float | None, typer.Option(help="Start of the test window in s; default as in the fit.")
     ] = None,
     stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
+    method: Method = "rk4",
+    step: Step = None,
+    interpolation: Interpolation = None,
     intervals: IntervalFile = None,
     quiet: Quiet = False,
 ) -> None:
@@ -195,6 +225,7 @@ def validate(
     from dfsm.validation.validate import compared
     from dfsm.validation.validate import validate as run_validate
 
+    settings = marching(method, step, interpolation)
     targets = [path for path in (output, metrics) if path is not None]
     for path in targets:
         check_file(path)
@@ -209,7 +240,9 @@ def validate(
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
-        validation = run_validate(candidates, runs, start=start, stop=stop, intervals=calibrated)
+        validation = run_validate(
+            candidates, runs, start=start, stop=stop, settings=settings, intervals=calibrated
+        )
         if output is not None:
             write_report({model.name or str(model): validation}, output)
     if metrics is not None:
@@ -230,10 +263,9 @@ def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
     start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
-    method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
-    step: Annotated[
-        float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
-    ] = None,
+    method: Method = "rk4",
+    step: Step = None,
+    interpolation: Interpolation = None,
     intervals: IntervalFile = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -244,12 +276,10 @@ def simulate(
     from dfsm.data.readers.tables import table_suffix, write_table
     from dfsm.models.model_folder import load
     from dfsm.models.signals import with_computed
-    from dfsm.simulation.simulate import METHODS, SimulationSettings
     from dfsm.simulation.simulate import simulate as run_simulate
     from dfsm.validation.intervals import load_intervals
 
-    if method not in METHODS:
-        raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    settings = marching(method, step, interpolation)
     table_suffix(output)
     check_file(output, [path for path in (run, intervals) if path and Path(path).exists()])
     surrogate = load(model)
@@ -265,7 +295,7 @@ def simulate(
             recorded,
             start=start,
             stop=stop,
-            settings=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
+            settings=settings,
         )
     write_table(
         result.trajectory if calibrated is None else calibrated.beside(result, recorded), output

@@ -99,6 +99,14 @@ def resolved(
     return tuple(chosen.get(n, kind) for n, kind in zip(names, rest, strict=True))
 
 
+def combined(first: Chosen, then: Chosen, names: Sequence[str]) -> Chosen:
+    """What two choices say together of some inputs: the first goes before, name by name."""
+    if isinstance(first, str):
+        return first
+    rest = dict.fromkeys(names, then) if isinstance(then, str) else then
+    return {**(rest or {}), **(first or {})} or None
+
+
 def parse_chosen(text: str | None) -> Chosen:
     """Read what a command line says: one kind, or ``name=kind`` separated by commas.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class ChannelInfo:
     name, unit
         As in the file.
     min, max, mean, std
-        Over the finite samples; NaN where there is none. `std` divides by the sample count.
+        Over the finite samples; NaN where there is none. `mean` and `std` are those over time,
+        whatever the mesh; on an equidistant one `std` divides by the sample count.
     step
         Quantisation step, None where the file states none.
     """
@@ -96,6 +98,7 @@ def describe(trajectory: Trajectory) -> RunInfo:
         Times in s, the rest in the channels' units.
     """
     steps = np.diff(trajectory.time)
+    weights = weights_over_time([trajectory.time])
     return RunInfo(
         name=trajectory.name,
         source=trajectory.source,
@@ -107,15 +110,16 @@ def describe(trajectory: Trajectory) -> RunInfo:
         max_interval=float(steps.max()),
         wall_time=trajectory.wall_time,
         channels=tuple(
-            _channel_info(c, v)
+            _channel_info(c, v, weights)
             for c, v in zip(trajectory.channels, trajectory.values.T, strict=True)
         ),
         warnings=tuple(_warnings(trajectory)),
     )
 
 
-def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
-    good = values[np.isfinite(values)]
+def _channel_info(channel: Channel, values: Array, weights: Array | None) -> ChannelInfo:
+    finite = np.isfinite(values)
+    good, weights = values[finite], None if weights is None else weights[finite]
     if not len(good):
         nan = math.nan
         return ChannelInfo(channel.name, channel.unit, nan, nan, nan, nan, channel.step)
@@ -124,8 +128,8 @@ def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
         channel.unit,
         float(good.min()),
         float(good.max()),
-        float(good.mean()),
-        float(good.std()),
+        float(mean_over(good, weights)),
+        float(std_over(good, weights)),
         channel.step,
     )
 
@@ -149,7 +153,13 @@ def gap_warning(trajectory: Trajectory) -> str | None:
     """
     steps = np.diff(trajectory.time)
     gap = int(np.argmax(steps))
-    if steps[gap] <= _GAP * np.median(steps):
+    others = np.sort(np.delete(steps, gap))
+    if not len(others):
+        return None
+    # The usual step is that of half the time, not of half the samples: an adaptive solver may put
+    # most of these where it starts.
+    usual = others[np.searchsorted(np.cumsum(others), others.sum() / 2)]
+    if steps[gap] <= _GAP * usual:
         return None
     return (
         f"there is a gap of {steps[gap]:g} s after {trajectory.time[gap]:g} s, which a fit bridges "

@@ -21,6 +21,7 @@ from dfsm.fitting.fit import fit
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import with_computed
+from dfsm.numerics.time_mesh import weights_over_time
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
@@ -150,9 +151,7 @@ def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
     pairs = list(zip((s.trajectory for s in simulations), course.references, strict=True))
     measured = [c.name for c in model.signals.observed if c.name in course.references[0]]
     nrmse = {
-        n: None
-        if diverged
-        else float(np.mean([ChannelError.of(x[n], r[n]).nrmse for x, r in pairs]))
+        n: None if diverged else float(np.mean([_nrmse(x, r[n], n) for x, r in pairs]))
         for n in measured
     }
     return Outcome(
@@ -161,6 +160,11 @@ def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
         simulate_seconds=float(np.mean([s.wall_time for s in simulations])),
         parameters=Parametrization.of(model, np.ones(len(model.signals.observed))).size,
     )
+
+
+def _nrmse(rollout: Trajectory, reference: Array, name: str) -> float:
+    weights = weights_over_time([rollout.time])
+    return ChannelError.of(rollout[name], reference, weights).nrmse
 
 
 def _reference(run: Trajectory, settings: FitSettings) -> dict[str, Array]:

@@ -13,6 +13,7 @@ import numpy as np
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
+from dfsm.data.between import jumps
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
@@ -21,6 +22,7 @@ from dfsm.models.latents import latent_path
 from dfsm.models.signals import Azimuth, radians_per_second, with_computed
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
 from dfsm.validation.intervals import Intervals
 from dfsm.validation.results import (
@@ -96,6 +98,15 @@ def validate(
     results = []
     for run in track(runs, "test runs"):
         results.append(_compare(models, run, (start, stop), settings, intervals))
+    stepped = [
+        f"{name} on {r.recorded.name}: {m.simulation.note}"
+        for r in results
+        for name, m in r.models.items()
+        if m.simulation.note
+    ]
+    if stepped:
+        more = f" (and {len(stepped) - 1} more rollouts alike)" if stepped[1:] else ""
+        notes.append(stepped[0] + more)
     channels = (*first.signals.observed, *first.signals.outputs)
     return Validation(
         models=dict(models),
@@ -134,11 +145,13 @@ def _compare(
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
-    rates = differentiate(run, s.specs, s.derivatives)
+    breaks = jumps(run, s.driving, s.between_samples()[: len(s.driving)])
+    rates = differentiate(run, s.specs, s.derivatives, breaks)
     inside = rates.trajectory.window(*window)
     rows = np.isin(rates.trajectory.time, inside.time)
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
+    weights = weights_over_time([recorded.time])
     results = {}
     for name, model in models.items():
         simulation = _simulate_warm(model, run, window, settings)
@@ -151,7 +164,8 @@ def _compare(
         band, coverage = None, {}
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
-                errors[c.name] = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
+                found, true = simulation.trajectory[c.name], recorded[c.name]
+                errors[c.name] = ChannelError.of(found, true, weights)
             statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
@@ -161,7 +175,9 @@ def _compare(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
-            derivative_errors=_derivative_errors(first, predicted, rates.derivatives[rows]),
+            derivative_errors=_derivative_errors(
+                first, predicted, rates.derivatives[rows], weights
+            ),
             band=band,
             coverage=coverage,
         )
@@ -200,9 +216,11 @@ def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Traje
     )
 
 
-def _derivative_errors(model: DFSM, predicted: Array, extracted: Array) -> dict[str, float]:
-    rms = np.sqrt(np.mean((predicted - extracted) ** 2, axis=0))
-    spread = np.maximum(extracted.std(axis=0), np.finfo(float).tiny)
+def _derivative_errors(
+    model: DFSM, predicted: Array, extracted: Array, weights: Array | None
+) -> dict[str, float]:
+    rms = np.sqrt(mean_over((predicted - extracted) ** 2, weights))
+    spread = np.maximum(std_over(extracted, weights), np.finfo(float).tiny)
     names = [c.name for c in model.signals.observed]
     return dict(zip(names, (rms / spread).tolist(), strict=True))
 
@@ -218,7 +236,8 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
         azimuth = Azimuth(speed=speeds[0]) if speeds else None
     if azimuth is None:
         return PLATFORM, WAVE, LOW
-    omega = recorded[azimuth.speed].mean() * radians_per_second(recorded.channel(azimuth.speed))
+    speed = mean_over(recorded[azimuth.speed], weights_over_time([recorded.time]))
+    omega = float(speed) * radians_per_second(recorded.channel(azimuth.speed))
     passing = azimuth.blades * omega / (2 * np.pi)
     return PLATFORM, WAVE, Band(f"{azimuth.blades}P", 0.8 * passing, 1.2 * passing), LOW
 
@@ -227,8 +246,9 @@ def _all_statistics(
     run: Trajectory, bands: Sequence[Band], loads: Sequence[str]
 ) -> dict[str, ChannelStatistics]:
     if run.time_step is None:
-        # Spectra need an equidistant mesh; the median step keeps what the samples resolve.
-        step = float(np.median(np.diff(run.time)))
+        # Spectra need an equidistant mesh; the median step keeps what the samples resolve, unless
+        # most of them stand for next to no time.
+        step = max(float(np.median(np.diff(run.time))), run.duration / (len(run) - 1))
         run = run.resample(np.arange(run.time[0], run.time[-1], step))
     return {c.name: _statistics(run, c.name, bands, c.name in loads) for c in run.channels}
 
