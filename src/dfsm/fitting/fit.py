@@ -24,14 +24,15 @@ from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.readers.rotor_table import RotorTable
+from dfsm.data.steps import Slopes
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
-from dfsm.fitting.exact_steps import Slopes, over_intervals
 from dfsm.fitting.gate import correct, predicted
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents

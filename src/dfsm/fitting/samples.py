@@ -19,10 +19,10 @@ from dfsm.data.derivatives import (
     state_units,
 )
 from dfsm.data.info import gap_warning
+from dfsm.data.steps import Steps
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
-from dfsm.fitting.exact_steps import Steps
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.inputs import InputOrder
 from dfsm.models.signals import (
@@ -205,7 +205,7 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         if kinked:
             values = run.select(signals.exogenous).values
             inputs = polynomials(run.time, values, signals.between_samples())
-            steps.append(Steps.of(extracted, rows, inputs, settings.states))
+            steps.append(Steps.of(extracted, rows, inputs, settings.states, len(signals.driving)))
         parts.append(
             [
                 inside.select(order.names).values,

@@ -19,8 +19,8 @@ from dfsm.numerics.smoothing import checked
 from dfsm.numerics.time_mesh import same_instant
 
 # Samples of a piece that tell its derivatives by themselves: where there are samples before and
-# after each jump, as many as a smoothing spline needs. Elsewhere, means over intervals are nearer to
-# the truth until noise covers them: measured on oscillators with 0.01 to 0.1 % of noise.
+# after each jump, as many as a smoothing spline needs. Elsewhere, means over intervals are nearer
+# to the truth until noise covers them: measured on oscillators with 0.01 to 0.1 % of noise.
 _LONG, _LONG_WITHOUT = 20, 200
 
 # Values, first and second derivative of samples on a mesh, and the noise where it is known.

@@ -26,11 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
-from dfsm.data.between import jumps
-from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, as_states, evolve, poles, rest
+from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import with_computed
 from dfsm.numerics.filters import moving_average
 from dfsm.refinement.growth import StabilityKept
@@ -121,8 +120,7 @@ def record_of(
     s = model.signals
     run = with_computed(run, s.hub_height, s.features)
     kinds = s.between_samples()
-    breaks = jumps(run, s.driving, kinds[: len(s.driving)])
-    extracted = differentiate(run, s.specs, s.derivatives, breaks)
+    recorded = recorded_states(model, run)
     window = run.window(start, stop)
     count = int(window.duration / step * (1 + 1e-9))
     before = int((window.time[0] - run.time[0]) / step * (1 + 1e-9))
@@ -136,13 +134,12 @@ def record_of(
     held = np.array([kind == "hold" for kind in kinds], dtype=bool)
     for k in np.flatnonzero(held):
         inputs[k] = _held_along(mesh, run.time, run[s.exogenous[k]])
-    states = extracted.trajectory.select(extracted.names)
     at = mesh[2 * before :: 2]
-    slopes = [np.interp(at, run.time, d) for d in extracted.derivatives.T]
+    slopes = [np.interp(at, run.time, d) for d in recorded.found.derivatives.T]
     return Record(
         step,
         before,
-        states.resample(at).values,
+        recorded.at(at),
         np.stack(slopes, axis=1),
         np.stack(inputs, axis=1),
         rest(run.time, run.select(s.driving).values),

@@ -24,6 +24,7 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state
+from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import require_constant, require_field, with_computed
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.fastest import REACH, fastest_rate
@@ -336,12 +337,14 @@ def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     s = model.signals
     measured = [n for spec in s.specs for n in (spec.name, spec.rate) if n is not None]
     specs = [replace(spec, acceleration=None) for spec in s.specs]
-    run = run.select(dict.fromkeys(measured))
+    driving = [n for n in s.exogenous if n not in measured and n in run]
+    run = run.select(dict.fromkeys((*measured, *driving)))
     if all(spec.order == 1 or spec.rate for spec in specs):
         index = int(np.argmin(np.abs(run.time - start)))
         # Two samples make a trajectory, whose check says which channel is not finite and when.
         near = slice(max(0, index - 1), index + 1) if index else slice(0, 2)
-        replace(run, time=run.time[near], values=run.values[near]).require_finite()
+        near_by = replace(run, time=run.time[near], values=run.values[near])
+        near_by.select(dict.fromkeys(measured)).require_finite()
         values = dict(zip(run.names, run.values[index], strict=True))
         rates = [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
         return np.array([values[spec.name] for spec in specs] + rates)
@@ -352,7 +355,11 @@ def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     else:
         head = max(start + _HEAD, float(run.time[min(len(run), _HEAD_SAMPLES) - 1]))
         piece, row = run.window(start, head), 0
-    extracted = differentiate(piece.require_finite(), specs, s.derivatives)
+    piece.select(dict.fromkeys(measured)).require_finite()
+    if "hold" in s.between and len(driving) == len(s.exogenous) and not s.latents:
+        seen = recorded_states(model, piece)
+        return seen.trajectory.select(seen.found.names).values[row]
+    extracted = differentiate(piece, specs, s.derivatives)
     return extracted.trajectory.select(extracted.names).values[row]
 
 

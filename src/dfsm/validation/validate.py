@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
-from dfsm.data.between import jumps
-from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_path
+from dfsm.models.recorded import Recorded, recorded_states
 from dfsm.models.signals import Azimuth, radians_per_second, with_computed
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
@@ -145,20 +145,15 @@ def _compare(
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
-    breaks = jumps(run, s.driving, s.between_samples()[: len(s.driving)])
-    rates = differentiate(run, s.specs, s.derivatives, breaks)
-    inside = rates.trajectory.window(*window)
-    rows = np.isin(rates.trajectory.time, inside.time)
+    seen = recorded_states(first, run)
+    inside = seen.trajectory.window(*window)
+    rows = np.isin(run.time, inside.time)
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
     weights = weights_over_time([recorded.time])
     results = {}
     for name, model in models.items():
         simulation = _simulate_warm(model, run, window, settings)
-        states = inside.select(c.name for c in s.observed).values
-        states = np.concatenate([states, latent_path(model, run)[rows]], axis=1)
-        u, w, p = (inside.select(s.names(g)).values for g in _EXOGENOUS)
-        predicted = np.asarray(model.derivative(states, u, w, p))[:, : len(s.observed)]
         errors: dict[str, ChannelError] = {}
         statistics: dict[str, ChannelStatistics] = {}
         band, coverage = None, {}
@@ -175,9 +170,7 @@ def _compare(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
-            derivative_errors=_derivative_errors(
-                first, predicted, rates.derivatives[rows], weights
-            ),
+            derivative_errors=_derivative_errors(model, run, seen, rows),
             band=band,
             coverage=coverage,
         )
@@ -217,11 +210,24 @@ def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Traje
 
 
 def _derivative_errors(
-    model: DFSM, predicted: Array, extracted: Array, weights: Array | None
+    model: DFSM, run: Trajectory, seen: Recorded, rows: NDArray[np.bool_]
 ) -> dict[str, float]:
+    """NRMSE of derivatives along the record: at samples, or over intervals where inputs jump."""
+    s = model.signals
+    if means := seen.mean_rows(rows):
+        inputs, extracted, weights = means
+        x, *exogenous = model.split(inputs)
+    else:
+        inside = seen.trajectory.window(run.time[rows][0], run.time[rows][-1])
+        states = inside.select(c.name for c in s.observed).values
+        x = np.concatenate([states, latent_path(model, run)[rows]], axis=1)
+        exogenous = [inside.select(s.names(g)).values for g in _EXOGENOUS]
+        extracted = seen.found.derivatives[rows]
+        weights = weights_over_time([inside.time])
+    predicted = np.asarray(model.derivative(x, *exogenous))[:, : len(s.observed)]
     rms = np.sqrt(mean_over((predicted - extracted) ** 2, weights))
     spread = np.maximum(std_over(extracted, weights), np.finfo(float).tiny)
-    names = [c.name for c in model.signals.observed]
+    names = [c.name for c in s.observed]
     return dict(zip(names, (rms / spread).tolist(), strict=True))
 
 

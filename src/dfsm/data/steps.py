@@ -1,4 +1,4 @@
-"""Rows of the derivative fit over intervals between samples, where inputs are held.
+"""What happens over intervals between samples, where inputs jump at these.
 
 Where inputs jump at samples, states have a kink there, and no spline tells the derivative. What
 happens over an interval is known exactly, though:
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +25,10 @@ from dfsm.core.types import Array
 from dfsm.data.derivatives import Differentiated, StateSpec
 from dfsm.numerics.time_mesh import same_instant
 
-if TYPE_CHECKING:
-    from dfsm.fitting.samples import Samples
+# Times that a model is asked for slopes, each time with the better rates of the last.
+_TURNS = 5
 
-# Fits after one another at most, and the change of all slopes, relative to their spread, that ends.
-_FITS, _SETTLED = 12, 1e-9
-# Weights that differ by less than this share are one.
-_EQUAL = 1e-3
-
-# f̂ of the linear fit, at inputs ``(row, input)``.
+# f̂ of a model, at inputs ``(row, input)``.
 Slopes = Callable[[Array], Array]
 # Values over some intervals at their start and end, and slopes there, each ``(interval, channel)``.
 _Ends = tuple[Array, Array, Array, Array]
@@ -57,6 +51,9 @@ class Steps:
         their slopes there, ``(time - 1, exogenous)``.
     specs
         Which states have an order of 2, and which a recorded rate.
+    driving
+        Exogenous columns that stand before the states in I, controls and disturbances; parameters
+        follow.
     """
 
     time: Array
@@ -67,6 +64,7 @@ class Steps:
     begin_slope: Array
     end_slope: Array
     specs: tuple[StateSpec, ...]
+    driving: int
 
     @classmethod
     def of(
@@ -75,6 +73,7 @@ class Steps:
         rows: NDArray[np.bool_],
         polynomials: Array,
         specs: Sequence[StateSpec],
+        driving: int,
     ) -> Steps:
         """Take them from a run and what its inputs are between samples.
 
@@ -86,8 +85,8 @@ class Steps:
             Samples in the time window, one after the other, ``(time,)``.
         polynomials
             Of controls, disturbances and parameters in the whole run, see `polynomials`.
-        specs
-            The states.
+        specs, driving
+            See `Steps`.
         """
         run = found.trajectory
         time = run.time[rows]
@@ -95,7 +94,15 @@ class Steps:
         d, c, b, a = polynomials[:, rows[:-1] & rows[1:]]
         end, end_slope = a + h * (b + h * (c + h * d)), b + h * (2 * c + 3 * h * d)
         states = run.select(found.names).values[rows]
-        return cls(time, states, found.direct[rows], a, end, b, end_slope, tuple(specs))
+        return cls(time, states, found.direct[rows], a, end, b, end_slope, tuple(specs), driving)
+
+    def window(self, inside: NDArray[np.bool_]) -> Steps:
+        """Some samples, one after the other, and the intervals between them."""
+        pairs = inside[:-1] & inside[1:]
+        sides = (self.begin, self.end, self.begin_slope, self.end_slope)
+        parts = (side[pairs] for side in sides)
+        some = self.time[inside], self.states[inside], self.own[inside]
+        return Steps(*some, *parts, self.specs, self.driving)
 
     @property
     def steps(self) -> Array:
@@ -128,17 +135,15 @@ class Steps:
             begin[:, q], end[:, q] = first[:, rate], last[:, rate]
         return begin, end
 
-    def modelled(self, slopes: Slopes, driving: int) -> tuple[Steps, tuple[Array, Array]]:
+    def modelled(self, slopes: Slopes) -> tuple[Steps, tuple[Array, Array]]:
         """Slopes by a model, and with them better rates of the states that have none recorded.
 
         Parameters
         ----------
         slopes
             The model.
-        driving
-            Exogenous columns that stand before the states in I; the others follow.
         """
-        n, count = driving, len(self.begin)
+        n, count = self.driving, len(self.begin)
         sides = zip((self.begin, self.end), self.ends, strict=True)
         inputs = np.concatenate([np.hstack([v[:, :n], x, v[:, n:]]) for v, x in sides])
         both = np.array(slopes(inputs))
@@ -161,15 +166,41 @@ class Steps:
             begin[:, q], end[:, q] = states[:-1, rate], states[1:, rate]
         return moved, (begin, end)
 
-    def rows(self, slopes: tuple[Array, Array], driving: int) -> tuple[Array, ...]:
+    def settled(self, slopes: Slopes) -> tuple[Steps, tuple[Array, Array]]:
+        """Rates and slopes by a model that is what it is, see `modelled`."""
+        steps, ends = self.modelled(slopes)
+        for _ in range(_TURNS if self.unseen else 0):
+            steps, ends = steps.modelled(slopes)
+        return steps, ends
+
+    def between(self, slopes: tuple[Array, Array], time: Array) -> Array:
+        """States at other times in s, ``(time, state)``: Hermite's cubics.
+
+        Parameters
+        ----------
+        slopes
+            At the ends of the intervals, by a model. Where its mean is not the change that was
+            recorded, the difference is added to both.
+        time
+            Within the run.
+        """
+        (first, last), h = self.ends, self.steps
+        missed = (last - first) / h - (slopes[0] + slopes[1]) / 2
+        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(h) - 1)
+        s = ((time - self.time[k]) / h[k, 0])[:, None]
+        begin, end = ((part + missed)[k] * h[k] for part in slopes)
+        change = (last - first)[k]
+        return first[k] + s * (
+            begin + s * (3 * change - 2 * begin - end + s * (begin + end - 2 * change))
+        )
+
+    def rows(self, slopes: tuple[Array, Array]) -> tuple[Array, ...]:
         """Mean inputs, mean derivatives, the time that each row stands for, and when.
 
         Parameters
         ----------
         slopes
             Of the states at the ends of the intervals, each ``(interval, state)``.
-        driving
-            As for `modelled`.
         """
         states = (*self.ends, *slopes)
         exogenous = (self.begin, self.end, self.begin_slope, self.end_slope)
@@ -189,7 +220,7 @@ class Steps:
             for q, rate in self.unseen:
                 x[:, rate] = rates[:, q]
                 rates[:, rate] = ((change[right] - change[left]) / span)[:, q]
-        n = driving
+        n = self.driving
         inputs = np.hstack([v[:, :n], x, v[:, n:]])
         return inputs[keep], rates[keep], span[keep, 0], middle[keep]
 
@@ -206,83 +237,3 @@ def _under_hats(ends: _Ends, h: Array, left: NDArray[np.int64], right: NDArray[n
     rising = 3 / 20 * first + 7 / 20 * last + h * (begin / 30 - end / 20)
     falling = 7 / 20 * first + 3 / 20 * last + h * (begin / 20 - end / 30)
     return (h * rising)[left] + (h * falling)[right]
-
-
-def over_intervals(samples: Samples, fit: Callable[[Samples], Slopes]) -> tuple[Samples, Samples]:
-    """Rows that a fit of the derivatives takes, and the samples with what was learnt meanwhile.
-
-    Parameters
-    ----------
-    samples
-        At points in time.
-    fit
-        Fits rows and returns the linear model of all derivatives.
-
-    Returns
-    -------
-    tuple of Samples
-        Rows over intervals, or at samples where these tell their derivative; and `samples` with
-        the rates of the states that have none recorded. Both are `samples` where inputs have no
-        jumps, or only few.
-    """
-    steps = list(samples.steps)
-    if not any(s.open.any() for s in steps):
-        return samples, samples
-    n = len(samples.signals.driving)
-    slopes = [s.straight() for s in steps]
-    rows = _rows(samples, steps, slopes, n)
-    last = np.inf
-    for _ in range(_FITS):
-        model = fit(rows)
-        pairs = [s.modelled(model, n) for s in steps]
-        change = max(
-            float(np.abs(new - old).max()) / (float(np.ptp(new)) or 1.0)
-            for (_, news), olds in zip(pairs, slopes, strict=True)
-            for new, old in zip(news, olds, strict=True)
-        )
-        # Intervals so long that the formulas say nothing more: what there is is best.
-        if not change < last:
-            break
-        steps, slopes = [s for s, _ in pairs], [s for _, s in pairs]
-        rows, last = _rows(samples, steps, slopes, n), change
-        if change < _SETTLED:
-            break
-    inputs = samples.inputs.copy()
-    inputs[:, samples.signals.state_columns] = np.concatenate([s.states for s in steps])
-    return rows, replace(samples, inputs=inputs)
-
-
-def _rows(
-    samples: Samples, steps: Sequence[Steps], slopes: Sequence[tuple[Array, Array]], n: int
-) -> Samples:
-    """Samples that tell their derivative, and intervals between others, run by run."""
-    parts: list[tuple[Array, ...]] = []
-    for k, (s, ends) in enumerate(zip(steps, slopes, strict=True)):
-        mine = np.flatnonzero(samples.runs == k)[s.own]
-        half = np.diff(s.time) / 2
-        stands = (np.append(half, 0.0) + np.insert(half, 0, 0.0))[s.own]
-        inputs, rates, spans, times = s.rows(ends, n)
-        run = (
-            np.concatenate([samples.inputs[mine], inputs]),
-            np.concatenate([samples.derivatives[mine], rates]),
-            np.concatenate([stands, spans]),
-            np.concatenate([s.time[s.own], times]),
-        )
-        order = np.argsort(run[-1], kind="stable")
-        parts.append((*(part[order] for part in run), np.full(len(order), k)))
-    inputs, derivatives, weights, times, runs = (
-        np.concatenate(p) for p in zip(*parts, strict=True)
-    )
-    alike = np.ptp(weights) <= _EQUAL * weights.mean()
-    none = {name: np.empty((0, 0)) for name in ("outputs", "harmonics", "field")}
-    return replace(
-        samples,
-        inputs=inputs,
-        derivatives=derivatives,
-        time=times,
-        psi=np.empty(0),
-        runs=runs,
-        weights=None if alike else weights / weights.mean(),
-        steps=(),
-        **none,
-    )
