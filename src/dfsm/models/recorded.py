@@ -61,7 +61,7 @@ class Recorded(NamedTuple):
         part = self.steps.window(inside)
         pairs = inside[:-1] & inside[1:]
         begin, end = (side[pairs] for side in self.slopes)
-        *rows, _ = part.rows((begin, end), self.steps.driving)
+        *rows, _ = part.rows((begin, end))
         return rows[0], rows[1], rows[2]
 
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
-from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.dfsm import DFSM
