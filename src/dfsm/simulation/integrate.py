@@ -16,20 +16,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array
-from dfsm.data.between import Between, polynomials
+from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.runge_kutta import rk4_step
-from dfsm.numerics.time_mesh import same_instant
+from dfsm.simulation.inputs import Pieces, at_parts, each, interpolated, pieces_of
+
+__all__ = [
+    "Case",
+    "Drive",
+    "Mesh",
+    "Pieces",
+    "Rollout",
+    "adapt",
+    "at_steps",
+    "march",
+    "mesh_of",
+    "pieces_of",
+    "rk4",
+    "stages",
+]
 
 # Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 1000
 _MAX_STEPS = 1_000_000
 # Fixed steps of one run, whose inputs and states are all held in memory.
 _MOST_STEPS = 10_000_000
-# Share of a channel's range by which inputs may leave a polynomial without a bend: rounding.
-_STRAIGHT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,34 +71,6 @@ class Mesh:
     def steps(self) -> int:
         """Number of steps."""
         return len(self.time) // 2
-
-
-@dataclass(frozen=True)
-class Pieces:
-    """Inputs at every time, as a polynomial between each two samples of a run.
-
-    Attributes
-    ----------
-    time
-        The run's samples in s, ``(sample,)``.
-    values
-        Inputs there, ``(sample, exogenous)``.
-    starts
-        Where each polynomial begins, in s, ``(piece,)``: at all samples but the last, and but the
-        first of two at one instant.
-    coefficients
-        Of the powers three to none of the time since then, ``(4, piece, exogenous)``.
-    bends, after
-        Samples at which one polynomial does not go on as the other, in s, ``(bend,)``; the second
-        of two at one instant in `after`, else the same.
-    """
-
-    time: Array
-    values: Array
-    starts: Array
-    coefficients: Array
-    bends: Array
-    after: Array
 
 
 Drive = TypeVar("Drive", Mesh, Pieces)
@@ -166,37 +151,11 @@ def mesh_of(driven: Trajectory, step: float | None, between: Between | Sequence[
         )
     every = max(1, int(np.ceil(parts)))
     parts = np.arange(2 * every) / (2 * every)
-    time = _between(driven.time[:, None], parts)[:, 0]
-    kinds = _each(driven, between)
+    time = at_parts(driven.time[:, None], parts)[:, 0]
+    kinds = each(driven, between)
     held = np.array([kind == "hold" for kind in kinds], dtype=bool)
-    inputs = _interpolated(driven, kinds, parts)
+    inputs = interpolated(driven, kinds, parts)
     return Mesh(time, inputs, every, held if held.any() else None)
-
-
-def pieces_of(driven: Trajectory, between: Between | Sequence[Between]) -> Pieces:
-    """Interpolate the inputs between samples.
-
-    Parameters
-    ----------
-    driven
-        The exogenous channels of one run.
-    between
-        As for `mesh_of`, which evaluates the same.
-    """
-    time, values, kinds = driven.time, driven.values, _each(driven, between)
-    apart = np.flatnonzero(~same_instant(time))
-    c = polynomials(time, values, kinds)[:, apart]
-    steps = np.diff(time)[apart, None]
-    degree = np.array([{"hold": 0, "linear": 1, "cubic": 3}[kind] for kind in kinds], dtype=int)
-    leading = np.take_along_axis(c, 3 - degree[None, None], axis=0)[0]
-    # How far the one polynomial, carried on over the next interval, misses the other.
-    missed = np.abs(np.diff(leading, axis=0)) * np.maximum(steps[1:], steps[:-1]) ** degree
-    reached = c[3] + steps * (c[2] + steps * (c[1] + steps * c[0]))
-    jumped = np.abs(c[3][1:] - reached[:-1])
-    least = _STRAIGHT * np.ptp(values, axis=0) + 8 * np.spacing(np.abs(values).max(axis=0))
-    bend = (np.maximum(missed, jumped) > least).any(axis=1)
-    before, after = time[apart[:-1] + 1][bend], time[apart[1:]][bend]
-    return Pieces(time, values, time[apart], c, before, after)
 
 
 def at_steps(field: Trajectory, mesh: Mesh, between: Between) -> Array:
@@ -207,34 +166,7 @@ def at_steps(field: Trajectory, mesh: Mesh, between: Between) -> Array:
     if mesh.every == 1 or not field.channels:
         return field.values
     kinds = (between,) * len(field.channels)
-    return _interpolated(field, kinds, np.arange(mesh.every) / mesh.every)
-
-
-def _each(driven: Trajectory, between: Between | Sequence[Between]) -> tuple[Between, ...]:
-    if isinstance(between, str):
-        return (between,) * len(driven.channels)
-    return tuple(between)
-
-
-def _interpolated(driven: Trajectory, kinds: Sequence[Between], parts: Array) -> Array:
-    """Inputs at fractions of every interval between samples, and at the last sample."""
-    inputs = _between(driven.values, parts)
-    others = [i for i, kind in enumerate(kinds) if kind != "linear"]
-    if others:
-        values, time = driven.values[:, others], driven.time
-        d, c, b, a = polynomials(time, values, [kinds[i] for i in others])[:, :, None]
-        t = (np.diff(time)[:, None] * parts)[..., None]
-        inputs[:-1, others] = (a + t * (b + t * (c + t * d))).reshape(-1, len(others))
-    return inputs
-
-
-def _between(values: Array, parts: Array) -> Array:
-    """Values at fractions of every interval between rows, and the last row."""
-    steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
-    inner = values[:-1, None, :] + steps
-    return np.concatenate(
-        [inner.reshape(inner.shape[0] * len(parts), values.shape[1]), values[-1:]]
-    )
+    return interpolated(field, kinds, np.arange(mesh.every) / mesh.every)
 
 
 # -- fixed steps --------------------------------------------------------------------------------
