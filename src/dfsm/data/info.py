@@ -98,7 +98,6 @@ def describe(trajectory: Trajectory) -> RunInfo:
         Times in s, the rest in the channels' units.
     """
     steps = np.diff(trajectory.time)
-    weights = weights_over_time([trajectory.time])
     return RunInfo(
         name=trajectory.name,
         source=trajectory.source,
@@ -110,16 +109,17 @@ def describe(trajectory: Trajectory) -> RunInfo:
         max_interval=float(steps.max()),
         wall_time=trajectory.wall_time,
         channels=tuple(
-            _channel_info(c, v, weights)
+            _channel_info(c, v, trajectory.time)
             for c, v in zip(trajectory.channels, trajectory.values.T, strict=True)
         ),
         warnings=tuple(_warnings(trajectory)),
     )
 
 
-def _channel_info(channel: Channel, values: Array, weights: Array | None) -> ChannelInfo:
+def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
     finite = np.isfinite(values)
-    good, weights = values[finite], None if weights is None else weights[finite]
+    good, time = values[finite], time[finite]
+    weights = weights_over_time([time]) if len(time) > 1 else None
     if not len(good):
         nan = math.nan
         return ChannelInfo(channel.name, channel.unit, nan, nan, nan, nan, channel.step)

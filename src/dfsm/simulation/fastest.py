@@ -15,8 +15,8 @@ from dfsm.core.types import Array
 from dfsm.models.dfsm import DFSM
 from dfsm.models.region import Region
 
-# Largest h |λ|: an error of one percent in a step of a mode that is over in a few.
-REACH = 1.0
+# Largest h |λ|: half of what is stable, where a mode is still followed and over in a few steps.
+REACH = 1.5
 # Samples of the inputs of a run at which a model is looked at.
 _PLACES = 16
 
