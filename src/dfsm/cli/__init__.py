@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,12 +23,16 @@ from dfsm.cli.optimize import optimize
 from dfsm.cli.terminal import (
     AsJson,
     Files,
+    Interpolation,
+    Method,
     ParameterFile,
     Quiet,
     SampleStep,
+    Step,
     as_in_fit,
     fit_start,
     lines,
+    marching,
     parametrized,
     print_json,
     say,
@@ -111,6 +116,13 @@ def init(
 def fit(
     config: Annotated[Path, typer.Argument(help="Configuration made by dfsm init.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Model folder to write.")],
+    interpolation: Annotated[
+        str | None,
+        typer.Option(
+            help="Inputs between samples, before those of the configuration: hold, linear or "
+            "cubic, or by name, u=hold,w=cubic."
+        ),
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -119,16 +131,22 @@ def fit(
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import visible
     from dfsm.core.lock import locked
+    from dfsm.data.between import combined, parse_chosen
     from dfsm.fitting.fit import fit as run_fit
     from dfsm.models.model_folder import check_target, save
     from dfsm.models.summary import lines_of
 
     check_target(output)
+    chosen = parse_chosen(interpolation)
     with locked(output):
         with working(quiet):
-            settings, runs = load_config(config)
+            config_settings, runs = load_config(config)
             tell_notes(runs, quiet)
-            result = run_fit(runs, settings.fit_settings(), settings.refine)
+            settings = config_settings.fit_settings()
+            if chosen is not None:
+                names = (*settings.controls, *settings.driving)
+                settings = replace(settings, inputs=combined(chosen, settings.inputs, names))
+            result = run_fit(runs, settings, config_settings.refine)
             model = result.model
         replaced = output.exists() and bool(visible(output))
         write_or_keep(lambda path: save(model, path, result.nonlinear), output)
@@ -216,6 +234,9 @@ def validate(
         float | None, typer.Option(help="Start of the test window in s; default as in the fit.")
     ] = None,
     stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
+    method: Method = "rk4",
+    step: Step = None,
+    interpolation: Interpolation = None,
     intervals: IntervalFile = None,
     parameters: ParameterFile = None,
     quiet: Quiet = False,
@@ -231,6 +252,7 @@ def validate(
     from dfsm.validation.validate import compared
     from dfsm.validation.validate import validate as run_validate
 
+    settings = marching(method, step, interpolation)
     targets = [path for path in (output, metrics) if path is not None]
     for path in targets:
         check_file(path)
@@ -246,7 +268,9 @@ def validate(
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
-        validation = run_validate(candidates, runs, start=start, stop=stop, intervals=calibrated)
+        validation = run_validate(
+            candidates, runs, start=start, stop=stop, settings=settings, intervals=calibrated
+        )
         if output is not None:
             label = model.name or str(model)
             write_or_keep(lambda path: write_report({label: validation}, path), output)
@@ -268,14 +292,9 @@ def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
     start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
-    method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
-    step: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest RK4 step in s; default the run's samples, whose interval it tells where "
-            "the file holds no times."
-        ),
-    ] = None,
+    method: Method = "rk4",
+    step: Step = None,
+    interpolation: Interpolation = None,
     intervals: IntervalFile = None,
     parameters: ParameterFile = None,
     changes: Annotated[
@@ -296,12 +315,10 @@ def simulate(
     from dfsm.models.completion import completed
     from dfsm.models.model_folder import load
     from dfsm.models.what_if import with_changes, with_inputs
-    from dfsm.simulation.simulate import METHODS, SimulationSettings
     from dfsm.simulation.simulate import simulate as run_simulate
     from dfsm.validation.intervals import load_intervals
 
-    if method not in METHODS:
-        raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    settings = marching(method, step, interpolation)
     table_suffix(output)
     check_file(output, [path for path in (run, inputs, intervals) if path and Path(path).exists()])
     surrogate = load(model)
@@ -322,7 +339,7 @@ def simulate(
             recorded,
             start=start,
             stop=stop,
-            settings=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
+            settings=settings,
         )
     table = result.trajectory if calibrated is None else calibrated.beside(result, recorded)
     write_or_keep(lambda path: write_table(table, path), output)

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dfsm.core.progress import show_progress
-from dfsm.errors import hushed, printable
+from dfsm.errors import DfsmError, hushed, printable
 
 if TYPE_CHECKING:
     from dfsm.data.trajectory import Trajectory
     from dfsm.models.dfsm import DFSM
+    from dfsm.simulation.simulate import SimulationSettings
 
 Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
@@ -35,6 +36,36 @@ def parametrized(runs: list[Trajectory], table: Path | None) -> list[Trajectory]
     from dfsm.data.parameters import read_parameters, with_parameters
 
     return runs if table is None else with_parameters(runs, read_parameters(table))
+
+
+Method = Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")]
+Step = Annotated[
+    float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
+]
+Interpolation = Annotated[
+    str | None,
+    typer.Option(
+        help="Inputs between samples: hold, linear or cubic, or by name, u=hold,w=cubic; default "
+        "as in the model."
+    ),
+]
+
+
+def marching(method: str, step: float | None, interpolation: str | None) -> SimulationSettings:
+    """How to simulate, as the command line says.
+
+    Raises
+    ------
+    DfsmError
+        There is no such method or way to interpolate.
+    """
+    from dfsm.data.between import parse_chosen
+    from dfsm.simulation.simulate import METHODS, SimulationSettings
+
+    if method not in METHODS:
+        raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    between = parse_chosen(interpolation)
+    return SimulationSettings(method=method, step=step, interpolation=between)  # pyright: ignore[reportArgumentType]
 
 
 @contextmanager

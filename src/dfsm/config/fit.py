@@ -12,6 +12,7 @@ from pydantic import Field, PrivateAttr, ValidationError, field_validator
 
 from dfsm.config.parse import Strict, explain, load_yaml, parse_file
 from dfsm.core.settings import require
+from dfsm.data.between import Between
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
 from dfsm.data.parameters import Table, names_in, read_parameters, with_parameters
@@ -139,6 +140,7 @@ class Config(Strict):
     corrective: Annotated[CorrectiveSettings, Field(discriminator="kind")] = MLP()
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
+    inputs: Between | dict[str, Between] | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
     refine: RefineSettings | None = None
     seed: int = FitSettings.seed
@@ -171,6 +173,7 @@ class Config(Strict):
             corrective=self.corrective,
             gate=self.gate,
             azimuth=self.azimuth,
+            inputs=self.inputs,
             nonlinear_only=self.nonlinear_only,
             seed=self.seed,
         )

@@ -16,6 +16,7 @@ from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrappi
 from dfsm.data.slower import slower_warning
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 
 # What differs from run to run in sentences that say the same: lists of channels, and numbers.
 _CHANNELS = re.compile(r"\bin '[^']*'(?:, '[^']*')*(?: and \d+ more channels)?")
@@ -31,7 +32,8 @@ class ChannelInfo:
     name, unit
         As in the file.
     min, max, mean, std
-        Over the finite samples; NaN where there is none. `std` divides by the sample count.
+        Over the finite samples; NaN where there is none. `mean` and `std` are those over time,
+        whatever the mesh; on an equidistant one `std` divides by the sample count.
     step
         Quantisation step, None where the file states none.
     """
@@ -116,17 +118,19 @@ def describe(trajectory: Trajectory) -> RunInfo:
         max_interval=float(steps.max()),
         wall_time=trajectory.wall_time,
         channels=tuple(
-            _channel_info(c, v)
+            _channel_info(c, v, trajectory.time)
             for c, v in zip(trajectory.channels, trajectory.values.T, strict=True)
         ),
         warnings=tuple(_warnings(trajectory)),
     )
 
 
-def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
-    if len(values) > _BLOCK:
-        return _long_channel_info(channel, values)
-    good = values[np.isfinite(values)]
+def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
+    if len(values) > _BLOCK and weights_over_time([time]) is None:
+        return _long_channel_info(channel, values, time)
+    finite = np.isfinite(values)
+    good, time = values[finite], time[finite]
+    weights = weights_over_time([time]) if len(time) > 1 else None
     if not len(good):
         nan = math.nan
         return ChannelInfo(channel.name, channel.unit, nan, nan, nan, nan, channel.step)
@@ -135,8 +139,8 @@ def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
         channel.unit,
         float(good.min()),
         float(good.max()),
-        float(good.mean()),
-        float(good.std()),
+        float(mean_over(good, weights)),
+        float(std_over(good, weights)),
         channel.step,
     )
 
@@ -145,14 +149,14 @@ def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
 _BLOCK = 1_000_000
 
 
-def _long_channel_info(channel: Channel, values: Array) -> ChannelInfo:
+def _long_channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
     """The same part by part; mean and standard deviation differ in their last digits."""
     low, high, total, count = math.inf, -math.inf, 0.0, 0
     for good in _finite_parts(values):
         low, high = min(low, float(good.min())), max(high, float(good.max()))
         total, count = total + float(good.sum()), count + len(good)
     if not count:
-        return _channel_info(channel, values[:1])
+        return _channel_info(channel, values[:1], time[:1])
     mean = total / count
     squares = sum(float(np.sum((good - mean) ** 2)) for good in _finite_parts(values))
     std = math.sqrt(squares / count)
@@ -190,7 +194,13 @@ def gap_warning(trajectory: Trajectory) -> str | None:
     """
     steps = np.diff(trajectory.time)
     gap = int(np.argmax(steps))
-    if steps[gap] <= _GAP * np.median(steps):
+    others = np.sort(np.delete(steps, gap))
+    if not len(others):
+        return None
+    # The usual step is that of half the time, not of half the samples: an adaptive solver may put
+    # most of these where it starts.
+    usual = others[np.searchsorted(np.cumsum(others), others.sum() / 2)]
+    if steps[gap] <= _GAP * usual:
         return None
     return (
         f"there is a gap of {steps[gap]:g} s after {trajectory.time[gap]:g} s, which a fit bridges "

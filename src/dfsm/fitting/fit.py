@@ -24,14 +24,16 @@ from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.readers.rotor_table import RotorTable
+from dfsm.data.steps import Slopes
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
-from dfsm.fitting.gate import correct, predict
+from dfsm.fitting.gate import correct, predicted
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
@@ -44,6 +46,7 @@ from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
 from dfsm.models.stability import destabilised
+from dfsm.numerics.time_mesh import mean_over, std_over
 from dfsm.refinement.refine import RefineSettings, refine
 
 
@@ -110,13 +113,14 @@ def fit(
     with _timed(seconds, "derivatives"):
         samples = extract(data, settings)
     with _timed(seconds, "linear fit"):
-        f = _fit_derivatives(samples, settings)
+        rows, samples = over_intervals(samples, lambda rows: _fit_slopes(rows, settings))
+        f = _fit_derivatives(rows, settings)
     with _timed(seconds, "doubts"):
-        inputs, targets = samples.linear_inputs, samples.derivatives
-        doubt = doubts(samples, f, targets - predict(f.model, samples, inputs, targets), settings)
+        residuals = rows.derivatives - predicted(f.model, rows.linear_inputs)
+        doubt = doubts(rows, f, residuals, settings)
     with _timed(seconds, "corrective functions"):
         later = refinement is not None and refinement.network > 0
-        e = correct(samples, samples.linear_inputs, samples.derivatives, f, settings, later)
+        e = correct(rows, rows.linear_inputs, rows.derivatives, f, settings, later)
     region = region_of(samples, f.model, data)
     model = DFSM(
         f=f.model,
@@ -168,11 +172,11 @@ def fit(
         notes += more
     known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
     notes = list(dict.fromkeys(known))
-    checks = [*f.notes, *checks]
+    checks = [*_inputs_told(samples, settings), *f.notes, *checks]
     nonlinear = None
     if settings.nonlinear_only and not isinstance(settings.corrective, NoCorrection):
         with _timed(seconds, "nonlinear-only"):
-            nonlinear = _fit_nonlinear(samples, region, settings)
+            nonlinear = _fit_nonlinear(samples, rows, region, settings)
             if nonlinear.signals.field:
                 nonlinear, *_ = fit_passing(nonlinear, samples, data)
     outputs = e_g.decisions if e_g else []
@@ -217,7 +221,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])
     L[:, fitted], b[:, fitted] = result.model.coefficients, result.model.offsets
-    rms, std = np.zeros(L.shape[1]), samples.derivatives.std(axis=0)
+    rms, std = np.zeros(L.shape[1]), std_over(samples.derivatives, samples.weights)
     rms[fitted] = result.residual_rms
     for row, rate in kinematic.items():
         L[:, row, columns.start + rate] = 1.0
@@ -229,6 +233,29 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
         tuple((fitted[row], column) for row, column in result.model.known),
     )
     return replace(result, model=model, residual_rms=rms, target_std=std)
+
+
+def _fit_slopes(rows: Samples, settings: FitSettings) -> Slopes:
+    """The linear fit of ξ̇ alone, as a function of I."""
+    model = _fit_derivatives(rows, settings).model
+    return lambda inputs: predicted(model, replace(rows, inputs=inputs).linear_inputs)
+
+
+def _inputs_told(samples: Samples, settings: FitSettings) -> tuple[str, ...]:
+    """Which inputs were recognised as held, and what to set where they are not."""
+    names = samples.signals.driving
+    chosen = settings.inputs or {}
+    if isinstance(chosen, str):
+        return ()
+    kinds = zip(names, samples.signals.between, strict=True)
+    held = [name for name, kind in kinds if kind == "hold" and name not in chosen]
+    if not held:
+        return ()
+    which = ", ".join(held)
+    return (
+        f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
+        f"samples (for lines set inputs: {{{held[0]}: linear}})",
+    )
 
 
 def _account(
@@ -283,29 +310,30 @@ def _linear(
                 f"choose one of {', '.join(names)}"
             )
         column = names.index(settings.linear.schedule)
-        windows = schedule_windows(inputs[:, column], settings.linear.points)
-    return fit_linear(samples.blocks(inputs, targets), names, settings.linear, windows, known)
+        windows = schedule_windows(inputs[:, column], settings.linear.points, samples.weights)
+    blocks = samples.weighted_blocks(inputs, targets)
+    return fit_linear(blocks, names, settings.linear, windows, known)
 
 
 # -- nonlinear-only, for comparison --------------------------------------------------------------
 
 
-def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> DFSM:
+def _fit_nonlinear(samples: Samples, rows: Samples, region: Region, settings: FitSettings) -> DFSM:
     """f̂_NL: the same corrective function for every row, and nothing linear under it."""
 
-    def part(inputs: Array, targets: Array) -> tuple[LinearModel, Corrective | None]:
-        mean = targets.mean(axis=0)
+    def part(of: Samples, inputs: Array, targets: Array) -> tuple[LinearModel, Corrective | None]:
+        mean = mean_over(targets, of.weights)
         trained = fit_corrective(
-            inputs, targets - mean, samples.runs, settings.corrective, settings.seed
+            inputs, targets - mean, of.runs, settings.corrective, settings.seed, of.weights
         )
         if trained is None:
             raise ValueError("nothing to fit")
         zero = jnp.zeros((1, targets.shape[1], inputs.shape[1]))
         return LinearModel(jnp.zeros(1), zero, jnp.asarray(mean)[None], None), trained.function
 
-    f, e = part(samples.inputs, samples.derivatives)
+    f, e = part(rows, rows.inputs, rows.derivatives)
     inputs = samples.without_terms(samples.output_inputs)
-    g, e_g = part(inputs, samples.outputs) if settings.outputs else (None, None)
+    g, e_g = part(samples, inputs, samples.outputs) if settings.outputs else (None, None)
     return DFSM(
         f=f,
         e=e,

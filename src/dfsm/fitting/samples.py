@@ -10,16 +10,19 @@ from scipy.integrate import cumulative_trapezoid
 
 from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
+from dfsm.data.between import Between, jumps, polynomials, recognised, resolved
 from dfsm.data.conversion import in_units_of
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
     differentiate,
     lead_in,
+    require_moving,
     state_names,
     state_units,
 )
 from dfsm.data.info import gap_warning
 from dfsm.data.slower import fill_slower
+from dfsm.data.steps import Steps
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
@@ -36,6 +39,7 @@ from dfsm.models.signals import (
     with_computed,
 )
 from dfsm.models.terms import Terms, terms_of
+from dfsm.numerics.time_mesh import same_instant, weights_over_time
 
 # Share by which the recorded azimuth may turn faster or slower than the speed says.
 _SAME_SPEED = 0.05
@@ -62,6 +66,11 @@ class Samples:
         Name and unit of each state derivative.
     terms
         Known terms of the linear fits.
+    weights
+        Of the samples by the time that they stand for, 1 on average, shape ``(sample,)``; None
+        where all count alike, see `weights_over_time`.
+    steps
+        Intervals of every run, for those in which inputs jump.
     """
 
     inputs: Array
@@ -75,6 +84,8 @@ class Samples:
     signals: SignalTable
     derivative_names: tuple[tuple[str, str], ...]
     terms: Terms | None = None
+    weights: Array | None = None
+    steps: tuple[Steps, ...] = ()
 
     @property
     def linear_inputs(self) -> Array:
@@ -107,9 +118,21 @@ class Samples:
 
     def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
         """Samples run by run."""
+        for inside in self._runs():
+            yield inputs[inside], targets[inside]
+
+    def weighted_blocks(
+        self, inputs: Array, targets: Array
+    ) -> Iterator[tuple[Array, Array, Array | None]]:
+        """Samples run by run with their weights."""
+        for inside in self._runs():
+            weights = None if self.weights is None else self.weights[inside]
+            yield inputs[inside], targets[inside], weights
+
+    def _runs(self) -> Iterator[slice]:
         ends = np.flatnonzero(np.diff(self.runs, append=-1)) + 1
         for start, stop in zip([0, *ends[:-1]], ends, strict=True):
-            yield inputs[start:stop], targets[start:stop]
+            yield slice(start, stop)
 
 
 def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
@@ -177,11 +200,14 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
 def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
     signals = _signals(data, settings)
+    steps: list[Steps] = []
+    kinked = "hold" in signals.between or any(same_instant(run.time).any() for run in data)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
     for whole_run in track(data, "derivatives"):
         run = lead_in(whole_run, settings.start, settings.derivatives)
-        extracted = differentiate(run, settings.states, settings.derivatives)
+        breaks = jumps(run, signals.driving, signals.between)
+        extracted = differentiate(run, settings.states, settings.derivatives, breaks)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
         inside = whole.window(settings.start, settings.stop)
@@ -193,6 +219,10 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         harmonics = np.empty((len(psi), 0))
         if azimuth is not None and not azimuth.rings:
             harmonics = np.asarray(blade_harmonics(psi, azimuth.blades))
+        if kinked:
+            values = run.select(signals.exogenous).values
+            inputs = polynomials(run.time, values, signals.between_samples())
+            steps.append(Steps.of(extracted, rows, inputs, settings.states, len(signals.driving)))
         parts.append(
             [
                 inside.select(order.names).values,
@@ -205,9 +235,11 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
             ]
         )
     lengths = [len(p[0]) for p in parts]
+    weights = weights_over_time([p[5] for p in parts])
     inputs, derivatives, outputs, harmonics, field, time, psi = (
         np.concatenate(c) for c in zip(*parts, strict=True)
     )
+    require_moving(settings.states, inputs[:, signals.observed_columns])
     return Samples(
         inputs=inputs,
         derivatives=derivatives,
@@ -220,6 +252,8 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         signals=signals,
         derivative_names=labels,
         terms=terms_of(settings.terms, signals.inputs, inputs),
+        weights=weights,
+        steps=tuple(steps),
     )
 
 
@@ -246,9 +280,17 @@ def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
         hub_height=settings.hub_height,
         features=settings.features,
         field=channels(settings.azimuth.field if settings.azimuth else (), "disturbance"),
+        between=_between(data, settings),
     )
     _ = table.azimuth_rate  # fails here, not in the middle of a simulation
     return table
+
+
+def _between(data: Dataset, settings: FitSettings) -> tuple[Between, ...]:
+    """What inputs do between samples: as chosen, else as it looks in the training data."""
+    names = (*settings.controls, *settings.driving)
+    windows = [run.window(settings.start, settings.stop) for run in data]
+    return resolved(settings.inputs, names, recognised(windows, names))
 
 
 def _azimuth(run: Trajectory, azimuth: Azimuth | None) -> Array:

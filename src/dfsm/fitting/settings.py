@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import field
 
 from dfsm.core.settings import require, settings_class
+from dfsm.data.between import Chosen, resolved
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
 from dfsm.data.slower import Slower
@@ -55,6 +56,10 @@ class FitSettings:
         What channels with fewer samples than their table do in between, see `fill_slower`.
     features
         Disturbances that are computed from others, see `Feature`; they follow those named.
+    inputs
+        What controls and disturbances do between samples: ``"hold"``, ``"linear"`` or ``"cubic"``,
+        for all or by name. Those not named are held where they stay and jump in the training data,
+        else joined by lines.
     nonlinear_only
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
@@ -80,6 +85,7 @@ class FitSettings:
     features: tuple[Feature, ...] = ()
     slower: Slower = None
     terms: tuple[TermSettings, ...] = ()
+    inputs: Chosen = field(default=None, hash=False)
     nonlinear_only: bool = True
     seed: int = 0
     outliers: Suspects = "refuse"
@@ -121,6 +127,7 @@ class FitSettings:
                         f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
                     )
                 roles.setdefault(name, role)
+        _ = resolved(self.inputs, (*self.controls, *self.driving))
         for feature in self.features:
             # What acted before now is known; optimal control refuses it, see `acting_late`.
             free: set[Role] = {_DISTURBANCE} | ({"control"} if feature.kind == "delay" else set())

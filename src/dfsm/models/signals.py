@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.settings import require, settings_class
 from dfsm.core.units import factor
+from dfsm.data.between import Between, Chosen, resolved
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature, with_features
 from dfsm.data.trajectory import Channel, Trajectory
@@ -121,6 +122,9 @@ class SignalTable:
         The last of the states: those that no channel holds, see `latents.py`.
     field
         Harmonics of the wind field, which drive ĝ alone; see `Azimuth`.
+    between
+        What controls and disturbances, in this order, do between samples, see `data.between`;
+        empty for lines.
     specs
         Which states are measured and which are their rates, see `StateSpec`.
     derivatives
@@ -146,6 +150,7 @@ class SignalTable:
     features: tuple[Feature, ...] = ()
     latents: tuple[Channel, ...] = ()
     field: tuple[Channel, ...] = ()
+    between: tuple[Between, ...] = ()
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
@@ -166,6 +171,12 @@ class SignalTable:
     def driving(self) -> tuple[str, ...]:
         """Names of controls and disturbances, the columns of B."""
         return self.order.driving
+
+    def between_samples(self, chosen: Chosen = None) -> tuple[Between, ...]:
+        """What each exogenous input does between samples; `chosen` goes before the model's own."""
+        kinds = resolved(chosen, self.driving, self.between)
+        # Parameters are constant: a line, whatever the others do.
+        return (*kinds, *("linear" for _ in self.parameters))
 
     @property
     def state_columns(self) -> slice:

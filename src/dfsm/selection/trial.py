@@ -22,6 +22,7 @@ from dfsm.fitting.fit import fit
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import with_computed
+from dfsm.numerics.time_mesh import weights_over_time
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
@@ -171,7 +172,9 @@ def _mean_nrmse(
     pairs: Sequence[tuple[Trajectory, Mapping[str, Array]]], name: str, usual: float
 ) -> float:
     """Over the runs in which a state moves; over all where it moves in none."""
-    errors = [(ChannelError.of(x[name], r[name]), r[name]) for x, r in pairs]
+    errors = [
+        (ChannelError.of(x[name], r[name], weights_over_time([x.time])), r[name]) for x, r in pairs
+    ]
     moving = [e.unless_still(recorded, usual).nrmse for e, recorded in errors]
     known = [v for v in moving if not np.isnan(v)]
     return float(np.mean(known or [e.nrmse for e, _ in errors]))

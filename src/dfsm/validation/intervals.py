@@ -23,6 +23,7 @@ from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Channel, Trajectory, labels
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.simulate import Simulation
 
 _FORMAT = 1
@@ -123,10 +124,11 @@ class Intervals:
         return rollout.trajectory.with_channels(ends, values)
 
     def coverage(self, rollout: Simulation, run: Trajectory, recorded: Trajectory) -> Array:
-        """Share of the samples whose recorded value lies inside, shape ``(channel,)``."""
+        """Share of the time in which the recorded value lies inside, shape ``(channel,)``."""
         low, high = (part.values for part in self.around(rollout, run))
         truth = recorded.select(self.channels).values[: len(low)]
-        return ((truth >= low) & (truth <= high)).mean(axis=0)
+        weights = weights_over_time([recorded.time[: len(low)]])
+        return mean_over((truth >= low) & (truth <= high), weights)
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file; an existing one is replaced when the new one is complete.

@@ -14,6 +14,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import printable
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.spectra import Spectrum
+from dfsm.numerics.time_mesh import mean_over, std_over
 from dfsm.simulation.simulate import MUCH_OUTSIDE, Simulation, Status
 from dfsm.validation.intervals import Intervals
 
@@ -69,10 +70,10 @@ class ChannelError:
     maximum: float
 
     @classmethod
-    def of(cls, simulated: Array, recorded: Array) -> ChannelError:
-        """Compare samples at the same times."""
-        difference, size = simulated - recorded, spread(recorded)
-        rmse = float(np.sqrt(np.mean(difference**2)))
+    def of(cls, simulated: Array, recorded: Array, weights: Array | None = None) -> ChannelError:
+        """Compare samples at the same times; `weights` as of `weights_over_time`."""
+        difference, size = simulated - recorded, spread(recorded, weights)
+        rmse = float(np.sqrt(mean_over(difference**2, weights)))
         return cls(rmse, rmse / size if size else float("inf"), float(np.abs(difference).max()))
 
     def unless_still(self, recorded: Array, usual: float) -> ChannelError:
@@ -98,9 +99,9 @@ def training_spreads(model: DFSM) -> dict[str, float]:
     return known | dict(zip(names, std.tolist(), strict=True))
 
 
-def spread(values: Array) -> float:
+def spread(values: Array, weights: Array | None = None) -> float:
     """Standard deviation; 0 for a constant, whose samples differ by rounding errors only."""
-    std = float(values.std())
+    std = float(std_over(values, weights))
     return std if std > 1e-12 * np.abs(values).max() else 0.0
 
 

@@ -16,15 +16,16 @@ from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.conversion import converted
-from dfsm.data.derivatives import differentiate, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_path
+from dfsm.models.recorded import Recorded, recorded_states
 from dfsm.models.signals import Azimuth, radians_per_second
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
 from dfsm.validation.intervals import Intervals
 from dfsm.validation.results import (
@@ -103,6 +104,15 @@ def validate(
     results = []
     for run in track(runs, "test runs"):
         results.append(_compare(models, run, (start, stop), settings, intervals))
+    stepped = [
+        f"{name} on {r.recorded.name}: {m.simulation.note}"
+        for r in results
+        for name, m in r.models.items()
+        if m.simulation.note
+    ]
+    if stepped:
+        more = f" (and {len(stepped) - 1} more rollouts alike)" if stepped[1:] else ""
+        notes.append(stepped[0] + more)
     channels = (*first.signals.observed, *first.signals.outputs)
     validation = Validation(
         models=dict(models),
@@ -142,27 +152,23 @@ def _compare(
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
-    rates = differentiate(lead_in(run, window[0], s.derivatives), s.specs, s.derivatives)
-    inside = rates.trajectory.window(*window)
-    rows = np.isin(run.time, inside.time)
-    measured = rates.derivatives[np.isin(rates.trajectory.time, inside.time)]
+    seen = recorded_states(first, run, window[0])
+    inside = seen.trajectory.window(*window)
     recorded = _recorded(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
+    weights = weights_over_time([recorded.time])
     usual = training_spreads(first)
     results = {}
     for name, model in models.items():
         simulation = _simulate_warm(model, run, window, settings)
-        states = inside.select(c.name for c in s.observed).values
-        states = np.concatenate([states, latent_path(model, run)[rows]], axis=1)
-        u, w, p = (inside.select(s.names(g)).values for g in _EXOGENOUS)
-        predicted = np.asarray(model.derivative(states, u, w, p))[:, : len(s.observed)]
         errors: dict[str, ChannelError] = {}
         statistics: dict[str, ChannelStatistics] = {}
         band, coverage = None, {}
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
-                error = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
-                errors[c.name] = error.unless_still(recorded[c.name], usual.get(c.name, 0.0))
+                rollout, true = simulation.trajectory[c.name], recorded[c.name]
+                error = ChannelError.of(rollout, true, weights)
+                errors[c.name] = error.unless_still(true, usual.get(c.name, 0.0))
             statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
@@ -172,7 +178,7 @@ def _compare(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
-            derivative_errors=_derivative_errors(first, predicted, measured),
+            derivative_errors=_derivative_errors(model, run, seen, inside.time),
             band=band,
             coverage=coverage,
         )
@@ -211,10 +217,25 @@ def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Traje
     )
 
 
-def _derivative_errors(model: DFSM, predicted: Array, extracted: Array) -> dict[str, float]:
-    rms = np.sqrt(np.mean((predicted - extracted) ** 2, axis=0))
-    spread = np.maximum(extracted.std(axis=0), np.finfo(float).tiny)
-    names = [c.name for c in model.signals.observed]
+def _derivative_errors(
+    model: DFSM, run: Trajectory, seen: Recorded, time: Array
+) -> dict[str, float]:
+    """NRMSE of derivatives along the record: at samples, or over intervals where inputs jump."""
+    s, rows = model.signals, np.isin(seen.trajectory.time, time)
+    if means := seen.mean_rows(rows):
+        inputs, extracted, weights = means
+        x, *exogenous = model.split(inputs)
+    else:
+        inside = seen.trajectory.window(time[0], time[-1])
+        states = inside.select(c.name for c in s.observed).values
+        x = np.concatenate([states, latent_path(model, run)[np.isin(run.time, time)]], axis=1)
+        exogenous = [inside.select(s.names(g)).values for g in _EXOGENOUS]
+        extracted = seen.found.derivatives[rows]
+        weights = weights_over_time([inside.time])
+    predicted = np.asarray(model.derivative(x, *exogenous))[:, : len(s.observed)]
+    rms = np.sqrt(mean_over((predicted - extracted) ** 2, weights))
+    spread = np.maximum(std_over(extracted, weights), np.finfo(float).tiny)
+    names = [c.name for c in s.observed]
     return dict(zip(names, (rms / spread).tolist(), strict=True))
 
 
@@ -229,7 +250,8 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
         azimuth = Azimuth(speed=speeds[0]) if speeds else None
     if azimuth is None:
         return PLATFORM, WAVE, LOW
-    omega = recorded[azimuth.speed].mean() * radians_per_second(recorded.channel(azimuth.speed))
+    speed = mean_over(recorded[azimuth.speed], weights_over_time([recorded.time]))
+    omega = float(speed) * radians_per_second(recorded.channel(azimuth.speed))
     passing = azimuth.blades * omega / (2 * np.pi)
     return PLATFORM, WAVE, Band(f"{azimuth.blades}P", 0.8 * passing, 1.2 * passing), LOW
 
@@ -238,8 +260,9 @@ def _all_statistics(
     run: Trajectory, bands: Sequence[Band], loads: Sequence[str]
 ) -> dict[str, ChannelStatistics]:
     if run.time_step is None:
-        # Spectra need an equidistant mesh; the median step keeps what the samples resolve.
-        step = float(np.median(np.diff(run.time)))
+        # Spectra need an equidistant mesh; the median step keeps what the samples resolve, unless
+        # most of them stand for next to no time.
+        step = max(float(np.median(np.diff(run.time))), run.duration / (len(run) - 1))
         run = run.resample(np.arange(run.time[0], run.time[-1], step))
     return {c.name: _statistics(run, c.name, bands, c.name in loads) for c in run.channels}
 
