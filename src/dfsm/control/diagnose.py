@@ -49,6 +49,14 @@ def conflict(program: Program, z: Array) -> str:
     return text + (f"; at their bounds are {', '.join(held)}" if held else "")
 
 
+def runaway(program: Program, z: Array) -> str:
+    """Say which variable ran away, and in which direction."""
+    sizes = [(np.abs(z[r.index]).max(initial=0.0), r) for r in program.variables]
+    _, rows = max(sizes, key=lambda pair: pair[0])
+    k = rows.index[int(np.argmax(np.abs(z[rows.index])))]
+    return f"{rows.name} runs away to {program.physical(z)[k]:.3g}"
+
+
 def _held(program: Program, z: Array) -> list[str]:
     """Variables that are at a bound, those with the largest share of the horizon first."""
     held = []
