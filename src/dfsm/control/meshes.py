@@ -201,6 +201,7 @@ def _refined(
             record.start,
             X=np.stack([grid.states(X, finer.tau) for X in record.start.X]),
             U=np.stack([grid.controls(U, finer.tau) for U in record.start.U]),
+            sizes=record.shot.layout.sizes(record.shot.program.scale),
         )
         before = (record.shot, record.outcome, record.start, record.estimate)
         shot = method.shot(problem, finer, start)

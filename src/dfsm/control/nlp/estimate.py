@@ -124,7 +124,9 @@ def estimate_of(shot: Transcription, outcome: Outcome, start: Start) -> Estimate
     with np.errstate(all="ignore"):  # a function may not be defined between the nodes
         dense = dense_of(shot, z, start)
         gaps = _finite(dense.slopes - dense.slope)[..., shot.layout.solved]
-        size = np.maximum(np.abs(start.X).max(axis=(0, 1)), 1e-3 * shot.state_sizes())
+        size = np.maximum(
+            np.abs(start.X).max(axis=(0, 1)), 1e-3 * shot.layout.sizes(shot.program.scale)[0]
+        )
         missing = dense.integral(np.abs(np.moveaxis(gaps, -1, 0)))
         dynamics = (missing / size[shot.layout.solved, None, None]).max(axis=(0, 1), initial=0.0)
         cost = _cost_gaps(shot, z, dense)

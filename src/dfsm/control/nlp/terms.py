@@ -136,6 +136,7 @@ class Functions:
         self._path = {n: c[0] for n, c in problem.constraints.items()}
         self._boundary = {n: c[0] for n, c in problem.boundary.items()}
         self._outputs = tuple(n for n in self.plant.names("outputs") if n in problem.bounds)
+        _check_model(self, problem)
         self.path_sizes, self.boundary_sizes, self.path_jumps = _sizes(self, problem)
         self.node = _joined(self._node_cost, self._node_constraints)
         self.ends = _joined(self._ends_cost, self._ends_constraints)
@@ -266,6 +267,25 @@ def scalar(function: Callable[..., Any], what: str, *arguments: Any) -> jax.Arra
     if value.shape != (1,):
         raise DfsmError(f"{what} returns {value.size} values, expected one number")
     return value
+
+
+def _check_model(functions: Functions, problem: OptimalControlProblem) -> None:
+    """Refuse a model whose functions return other numbers of values than it has channels."""
+    plant = functions.plant
+    arguments = [jnp.ones(len(plant.names(g))) for g in ("states", "controls", "disturbances")]
+    arguments.append(jnp.ones(len(plant.names("parameters"))))
+    for function, group, what in (
+        (plant.derivative, "states", "the model's f"),
+        (plant.output, "outputs", "the model's g"),
+    ):
+        count = len(plant.names(group))
+        label = f"{problem.name}: {what}"
+        shape = jax.eval_shape(lambda *a, f=function, w=label: vector(f, w, *a), *arguments).shape
+        if shape != (count,):
+            raise DfsmError(
+                f"{label} returns {shape[0]} values for the {count} {group} "
+                f"{', '.join(plant.names(group))}: return one number for each"
+            )
 
 
 def _sizes(

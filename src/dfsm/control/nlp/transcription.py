@@ -236,10 +236,6 @@ class Transcription(Shot):
         shape = (self.layout.scenarios, len(self.layout.control_nodes), width)
         return self._first_path + np.arange(np.prod(shape)).reshape(shape)
 
-    def state_sizes(self) -> Array:
-        """What the solver divides states by, shape ``(state,)``."""
-        return self.program.scale[self.layout.columns[0][0, 0]]
-
     def row_nodes(self) -> IntArray:
         """All of them."""
         return np.arange(self.layout.nodes)
