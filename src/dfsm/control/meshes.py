@@ -259,6 +259,8 @@ def _solve_scaled(
     if settings.warm and first.ending not in (*_GOOD, "interrupted", "time"):
         # What looked close was not: start afresh from the same point.
         first = _solve_once(program, z, replace(settings, warm=False), None)
+    if first.ending == "failed" and program.linear_quadratic:
+        first = _solve_once(program, z, replace(settings, warm=False, adaptive=False), None)
     if first.ending not in _GOOD:
         return first
     variation = program.variation(first.z)

@@ -80,6 +80,8 @@ class SolverSettings:
         Most steps.
     warm
         The start is near a solution: stay close to it, bounds included.
+    adaptive
+        Let the barrier of a linear-quadratic program adapt: fewer iterations, but no guarantee.
     until
         When to stop, as `time.perf_counter` counts; None for no limit.
     """
@@ -87,6 +89,7 @@ class SolverSettings:
     tolerance: float = 1e-8
     iterations: int = 500
     warm: bool = False
+    adaptive: bool = True
     until: float | None = None
 
 
@@ -133,21 +136,16 @@ def solve_nlp(
         raise watch.error
     stats = solver.stats()
     ending = _ending(stats["return_status"])
-    z, lam_g, lam_x = (np.array(last[k]).ravel() for k in ("x", "lam_g", "lam_x"))
-    if (
-        ending in ("interrupted", "limit", "time", "not finite", "failed")
-        and watch.best is not None
-    ):
-        z, lam_g, lam_x = watch.best
-    return Outcome(
-        z,
-        lam_g,
-        lam_x,
-        ending,
-        optimality(program, z, lam_g, lam_x),
-        int(stats["iter_count"]),
-        clock.perf_counter() - begin,
-    )
+    point = tuple(np.array(last[k]).ravel() for k in ("x", "lam_g", "lam_x"))
+    measured = optimality(program, *point)
+    if ending == "failed" and measured.held(settings.tolerance):
+        # It gives up, too, where rounding lets no step improve a point that is a solution.
+        ending = "stalled"
+    if ending in _BEST and watch.best is not None:
+        point = watch.best
+        measured = optimality(program, *point)
+    seconds = clock.perf_counter() - begin
+    return Outcome(*point, ending, measured, int(stats["iter_count"]), seconds)
 
 
 def _require_freedom(program: Program) -> None:
@@ -193,7 +191,9 @@ def _ipopt(program: Program, settings: SolverSettings, multipliers: bool) -> dic
         # Bounds are met exactly: users rely on them, and a square root on x ≥ 0.
         "ipopt.bound_relax_factor": 0.0,
         "ipopt.diverging_iterates_tol": _DIVERGED,
-        "ipopt.mu_strategy": "adaptive" if program.linear_quadratic else "monotone",
+        "ipopt.mu_strategy": (
+            "adaptive" if program.linear_quadratic and settings.adaptive else "monotone"
+        ),
     }
     if settings.until is not None:
         chosen["ipopt.max_wall_time"] = max(settings.until - clock.perf_counter(), 1e-3)
