@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.control.flown import commands_told
 from dfsm.control.solution import RATE, Solution
 from dfsm.core.files import json_value
 from dfsm.core.settings import require
@@ -107,6 +108,9 @@ class RunCheck:
         By name, in the solution's order.
     missing
         Channels of the solution that the run lacks.
+    commands
+        Of every control that was flown otherwise than commanded: by how much, and why, a sentence
+        each. Where there is one, other differences say little about the model.
     """
 
     name: str
@@ -119,6 +123,7 @@ class RunCheck:
     limits: Mapping[str, LimitCheck]
     channels: Mapping[str, ChannelCheck]
     missing: tuple[str, ...]
+    commands: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; None where not finite."""
@@ -173,6 +178,7 @@ def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunChec
         limits=_limits(solution, full.time, predicted, actual),
         channels={name: _channel(predicted, actual, name) for name in kept},
         missing=absent,
+        commands=commands_told(predicted, actual),
     )
 
 

@@ -22,6 +22,8 @@ from dfsm.data.trajectory import Trajectory
 
 # Times at which the argument of a search is followed.
 _FOLLOWED = 4001
+# Knots that are closer in normalised time are one.
+_APART = 1e-9
 
 
 def knots_of(problem: OptimalControlProblem, functions: Functions) -> Array:
@@ -36,7 +38,9 @@ def knots_of(problem: OptimalControlProblem, functions: Functions) -> Array:
     parts = [(run.time - problem.start) / span for run in runs]
     parts += _searched(problem, functions)
     knots = np.unique(np.concatenate([np.empty(0), *parts]))
-    return knots[(knots > 0) & (knots < 1)]
+    knots = knots[(knots > _APART) & (knots < 1 - _APART)]
+    # The same knot of two tables may differ by rounding.
+    return knots[np.diff(knots, prepend=-1.0) > _APART]
 
 
 def _searched(problem: OptimalControlProblem, functions: Functions) -> list[Array]:
