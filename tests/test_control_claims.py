@@ -133,15 +133,13 @@ def test_cuts_are_made_at_the_knots_of_tables(where):
 
 
 def test_a_finer_mesh_is_tried_where_the_coarse_one_is_infeasible():
-    # Three nodes of a control within bounds cannot reach both ends; nine can.
+    # Three nodes of a control within bounds cannot reach both ends; seven can.
     problem = moved(bounds={"u": (-5.0, 5.0), "v": (None, 1.6)})
-    found = solve(
-        problem, DirectTranscription(scheme="trapezoidal", mesh=2, refine=1e-2), simulate=False
-    )
+    method = DirectTranscription(scheme="trapezoidal", mesh=2, refine=1e-2)
+    found = solve(problem, method, simulate=False)
     assert found.solved
-    assert found.meshes[0]["intervals"] == 2
-    assert found.meshes[1]["intervals"] == 6
-    kept = solve(problem, DirectTranscription(scheme="trapezoidal", mesh=2, refine=None))
+    assert [mesh["intervals"] for mesh in found.meshes[:2]] == [2, 6]
+    kept = solve(problem, replace(method, refine=None))
     assert kept.ending is Ending.INFEASIBLE
 
 

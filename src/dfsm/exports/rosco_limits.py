@@ -88,7 +88,7 @@ def read_numbers(path: str | Path) -> dict[str, float]:
         except ValueError:
             continue
     if "PC_MaxPit" not in values:
-        raise DfsmError(f"{path} has no line of PC_MaxPit, expected a DISCON.IN of ROSCO")
+        raise DfsmError(f"{path} has no line of PC_MaxPit, expected a DISCON file of ROSCO")
     return values
 
 
