@@ -55,8 +55,8 @@ def run() -> dict[str, Any]:
     dict
         ``known``: per problem the optimal value, and per method the objective, its relative error
         and the estimate of that, iterations and seconds to solve; ``orders``: per smooth problem
-        and scheme the errors on 5 to 160 intervals; ``turbine``: per number of points the iterations and milliseconds per
-        iteration; ``expressions``: the same program in CasADi expressions, with times and
+        and scheme the errors on 5 to 160 intervals; ``turbine``: per number of points the
+        iterations and milliseconds per iteration; ``expressions``: the same program in CasADi expressions, with times and
         objectives.
     """
     return {

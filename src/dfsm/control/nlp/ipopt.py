@@ -136,7 +136,8 @@ def solve_nlp(
         raise watch.error
     stats = solver.stats()
     ending = _ending(stats["return_status"])
-    point = tuple(np.array(last[k]).ravel() for k in ("x", "lam_g", "lam_x"))
+    z, lam_g, lam_x = (np.array(last[k]).ravel() for k in ("x", "lam_g", "lam_x"))
+    point = z, lam_g, lam_x
     measured = optimality(program, *point)
     if ending == "failed" and measured.held(settings.tolerance):
         # It gives up, too, where rounding lets no step improve a point that is a solution.
