@@ -56,8 +56,8 @@ def run() -> dict[str, Any]:
         ``known``: per problem the optimal value, and per method the objective, its relative error
         and the estimate of that, iterations and seconds to solve; ``orders``: per smooth problem
         and scheme the errors on 5 to 160 intervals; ``turbine``: per number of points the
-        iterations and milliseconds per iteration; ``expressions``: the same program in CasADi expressions, with times and
-        objectives.
+        iterations and milliseconds per iteration; ``expressions``: the same program in CasADi
+        expressions, with times and objectives.
     """
     return {
         "known": known(),
