@@ -22,6 +22,10 @@ def export_rosco(
     step: Annotated[
         float | None, typer.Option(help="Time between rows in s; default the solution's nodes.")
     ] = None,
+    discon: Annotated[
+        Path | None,
+        typer.Option(help="DISCON.IN to fly it with: limits that it breaks are named."),
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -32,13 +36,20 @@ def export_rosco(
 
     check_file(output)
     written = write_rosco(
-        load_solution(result), output, pitch=pitch, torque=torque, scenario=scenario, step=step
+        load_solution(result),
+        output,
+        pitch=pitch,
+        torque=torque,
+        scenario=scenario,
+        step=step,
+        discon=discon,
     )
     if as_json:
         settings = {
             "pitch": written.pitch,
             "torque": written.torque,
             "discon": dict(written.discon),
+            "notes": list(written.notes),
         }
         print_json({"output": str(output), "rows": written.rows, **settings, "Ptch_Cntrl": 1})
         return

@@ -208,6 +208,10 @@ def print_check(check: RunCheck) -> None:
     part = "the whole horizon" if check.complete else "a part of the horizon"
     span = f"{check.start:g} to {check.stop:g} s, {part}"
     console.print(_text(f"{check.run} against {check.name}, {span}; figures: predicted → actual"))
+    for sentence in check.commands:
+        console.print(_text(sentence))
+    if check.commands:
+        console.print("so the run is no test of the model before its controls are those commanded")
     if check.power is not None:
         ahead, came = (_figure(check.power[k], ".5g") for k in ("predicted", "actual"))
         console.print(_text(f"mean power ({check.power_source}): {ahead} → {came} kW"))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.control.flown import commands_told
 from dfsm.control.solution import RATE, Solution
 from dfsm.core.files import json_value
 from dfsm.core.settings import require
@@ -118,6 +119,9 @@ class RunCheck:
         Channels of the solution that the run lacks.
     power_advice
         What to do where the power is not predicted; else "".
+    commands
+        Of every control that was flown otherwise than commanded: by how much, and why, a sentence
+        each. Where there is one, other differences say little about the model.
     """
 
     name: str
@@ -131,6 +135,7 @@ class RunCheck:
     channels: Mapping[str, ChannelCheck]
     missing: tuple[str, ...]
     power_advice: str = ""
+    commands: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; None where not finite."""
@@ -199,6 +204,7 @@ def check_run(
         channels={name: _channel(predicted, actual, name) for name in kept},
         missing=absent,
         power_advice=advice,
+        commands=commands_told(predicted, actual),
     )
 
 

@@ -26,12 +26,15 @@ class Start:
         Free parameters, shape ``(parameter,)``.
     stop
         Last time in s.
+    sizes
+        What a coarser mesh divided states and controls by; None before there is one.
     """
 
     X: Array
     U: Array
     p: Array
     stop: float
+    sizes: tuple[Array, Array] | None = None
 
 
 def start_of(

@@ -79,6 +79,8 @@ def save_solution(
         "replays": _apart("replays", [r.trajectory for r in solution.replays], tensors),
         "deviations": [[dict(r.deviation), r.relative] for r in solution.replays],
     }
+    if solution.errors:
+        content["errors"] = dict(solution.errors)
     if solution.optimality is not None:
         content["optimality"] = asdict(solution.optimality)
     pages = {} if page is None else {PAGE: lambda file: page(solution, file)}
@@ -129,6 +131,7 @@ def load_solution(path: str | Path) -> Solution:
             replays=tuple(replays),
             solver_state=tensors["solver_state"],
             optimality=_optimality(manifest),
+            errors=_numbers(manifest.get("errors", {})),
         )
         _check(solution)
     except (*_GARBLED, DfsmError) as error:
@@ -238,8 +241,12 @@ def _optimality(manifest: Mapping[str, Any]) -> Optimality | None:
     measured = manifest.get("optimality")
     if measured is None:
         return None
-    figures = {k: np.nan if v is None else float(v) for k, v in measured.items()}
-    return Optimality(**figures)
+    return Optimality(**_numbers(measured))
+
+
+def _numbers(values: Mapping[str, float | None]) -> dict[str, float]:
+    """What JSON holds for numbers that may be NaN."""
+    return {k: np.nan if v is None else float(v) for k, v in values.items()}
 
 
 def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:

@@ -7,6 +7,7 @@ at work, so that a horizon which begins at 100 s leaves 100 s for the turbine to
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,14 @@ from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.errors import DfsmError, near_matches, printable
+from dfsm.errors import DfsmError, DfsmWarning, near_matches, printable
+from dfsm.exports.rosco_limits import (
+    CUTS,
+    broken,
+    negative_torque,
+    pitch_needs,
+    read_numbers,
+)
 
 # More rows than this are a mistyped step.
 _MOST_ROWS = 1_000_000
@@ -71,6 +79,8 @@ class RoscoInput:
         column is then left out.
     discon
         Lines to set in ROSCO's DISCON file, value by name.
+    notes
+        What ROSCO does to the file that these lines do not show, a sentence each.
     """
 
     path: Path
@@ -78,13 +88,14 @@ class RoscoInput:
     pitch: str | None
     torque: str | None
     discon: Mapping[str, str]
+    notes: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """What to set, for people."""
         lines = ["DISCON.IN of ROSCO:"]
         lines += [f"  {value:<20} ! {name}" for name, value in self.discon.items()]
         lines.append("ServoDyn input file (ROSCO 2.10 gives every blade its pitch):")
-        return [*lines, f"  {'1':<20} ! Ptch_Cntrl"]
+        return [*lines, f"  {'1':<20} ! Ptch_Cntrl", *self.notes]
 
 
 def write_rosco(
@@ -95,6 +106,7 @@ def write_rosco(
     torque: str | None = None,
     scenario: int = 1,
     step: float | None = None,
+    discon: str | Path | None = None,
 ) -> RoscoInput:
     """Write optimal controls as an open-loop input file of ROSCO.
 
@@ -113,6 +125,9 @@ def write_rosco(
     step
         Time between rows in s, the controls in between by the scheme's polynomials; None writes
         the nodes of the solution.
+    discon
+        DISCON.IN that the file is to be flown with: every limit of it that the file breaks is told
+        in `notes`, and limits that are wide enough are left as they are.
 
     Returns
     -------
@@ -123,7 +138,13 @@ def write_rosco(
     DfsmError
         The solve did not succeed, no control is a pitch or a torque, a name that does not tell
         which, units of something else, or a file that cannot be written.
+
+    Warns
+    -----
+    DfsmWarning
+        The torque is negative somewhere, which ROSCO makes 0.
     """
+    known = None if discon is None else read_numbers(discon)
     if not solution.solved:
         raise DfsmError(f"{printable(solution.name)} was not solved: {solution.message}")
     run = _controls(solution, scenario, step)
@@ -145,17 +166,53 @@ def write_rosco(
             columns.append(taken[control.name])
             heads.append(f"{control.name} ({unit})")
             number[what] = len(columns)
+    rows = dict(zip(("time", *(w for w in chosen if chosen[w] is not None)), columns, strict=True))
     path = Path(path)
     _write(path, solution.name, heads, np.column_stack(columns))
     names = {what: None if control is None else control.name for what, control in chosen.items()}
-    discon = {
+    lines = {
         "OL_Mode": "1",
         "OL_Filename": f'"{path.name}"',
         "Ind_Breakpoint": "1",
         "Ind_BldPitch": " ".join(3 * [str(number["pitch"])]),
         "Ind_GenTq": str(number["torque"]),
     }
-    return RoscoInput(path, len(run), names["pitch"], names["torque"], discon)
+    more, notes = _limits(solution, rows, known)
+    return RoscoInput(path, len(run), names["pitch"], names["torque"], lines | more, notes)
+
+
+def _limits(
+    solution: Solution, rows: Mapping[str, Array], known: Mapping[str, float] | None
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Lines of DISCON.IN that let the file pass, and what they do not show."""
+    time, pitch, torque = (rows.get(k) for k in ("time", "pitch", "torque"))
+    assert time is not None
+    lines, notes = {}, [CUTS]
+    if pitch is not None:
+        lines["PC_ControlMode"] = "1"
+        actuator = [c.name for c in solution.trajectory.channels if _is_actuator(c)]
+        if actuator:
+            notes.append(
+                f"the model has {', '.join(actuator)} as a state and so its own pitch actuator: "
+                "leave PA_Mode and what belongs to it as the model has it"
+            )
+        else:
+            lines["PA_Mode"] = "0"
+        for key, needed in pitch_needs(time, pitch).items():
+            own = needed if known is None else known.get(key, needed)
+            wider = min(own, needed) if "Min" in key else max(own, needed)
+            lines[key] = f"{wider:.6g}"
+        if known is None:
+            notes.append("wider limits of the pitch and its rate than these serve as well")
+    if torque is not None and (negative := negative_torque(time, torque)):
+        warnings.warn(f"{printable(solution.name)}: {negative}", DfsmWarning, stacklevel=3)
+        notes.append(negative)
+    return lines, (*notes, *(broken(known, time, pitch, torque) if known is not None else ()))
+
+
+def _is_actuator(channel: Channel) -> bool:
+    """Whether a channel is the pitch that an actuator in the model answers with."""
+    return channel.role == "state" and _PITCH.names.fullmatch(channel.name) is not None
 
 
 def _controls(solution: Solution, scenario: int, step: float | None) -> Trajectory:
