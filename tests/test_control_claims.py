@@ -211,11 +211,15 @@ def test_a_singular_arc_chatters_with_hermite_simpson_and_not_with_radau():
         bounds={"u": (-1.0, 1.0)},
         cost=lambda s: (s.x.x**2 + s.x.v**2) / 2,
     )
-    found = solve(problem, replace(COARSE, mesh=60), simulate=False)
+    found = solve(problem, replace(COARSE, mesh=60, refine=1e-2), simulate=False)
     assert found.ending is Ending.CHATTERING
     assert not found.solved
     assert found.reason.startswith("u turns ")
     assert "use scheme radau" in found.message
+    # On a mesh that is to stay as it is, it is told.
+    kept = solve(problem, replace(COARSE, mesh=60), simulate=False)
+    assert kept.ending is Ending.SOLVED
+    assert "scheme radau follows the arc" in kept.message
     smooth = solve(problem, replace(COARSE, mesh=60, scheme="radau"), simulate=False)
     assert smooth.ending is Ending.SOLVED
     assert smooth.objective == pytest.approx(0.376992, rel=1e-4)

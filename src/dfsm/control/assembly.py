@@ -68,7 +68,7 @@ def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) 
     return Solution(
         name=problem.name,
         ending=ending,
-        reason=chatter if ending is Ending.CHATTERING else _reason(record, ending),
+        reason=_reason(record, ending, chatter),
         objective=objective,
         final_cost=final_cost,
         integral_cost=objective - final_cost,
@@ -97,14 +97,19 @@ def _ending(record: Record, chatter: str) -> Ending:
     ending, measured = _ENDINGS[record.outcome.ending], record.outcome.optimality
     if ending in _EARLY and not measured.held(record.tolerance):
         return Ending.INACCURATE
-    if ending.solved and chatter:
+    if ending.solved and chatter and record.refines:
         return Ending.CHATTERING
     return Ending.COARSE if ending.solved and record.coarse else ending
 
 
-def _reason(record: Record, ending: Ending) -> str:
+def _reason(record: Record, ending: Ending, chatter: str) -> str:
     shot, outcome = record.shot, record.outcome
     program, z, measured = shot.program, outcome.z, outcome.optimality
+    if ending is Ending.CHATTERING:
+        return chatter
+    if ending is Ending.SOLVED and chatter:
+        # On a mesh that is to stay as it is, errors between the nodes are told and no more.
+        return f"{chatter}, which the cost cannot tell from its mean: scheme radau follows the arc"
     if ending is Ending.COARSE:
         return _coarse(record)
     if ending is Ending.UNBOUNDED:

@@ -52,6 +52,8 @@ class Record:
         Its largest local error of the dynamics, and whether any error is above what was asked.
     estimate
         All errors on the last mesh.
+    refines
+        Whether errors between the nodes were to meet anything.
     why
         Why no finer mesh was tried although one was asked for; else "".
     tolerance, objective_scale
@@ -65,7 +67,7 @@ class Record:
         self.compile = self.solve = 0.0
         self.meshes: list[dict[str, Any]] = []
         self.iterations = 0
-        self.coarse = False
+        self.coarse = self.refines = False
         self.why = ""
         self.objective_scale = 1.0
 
@@ -132,6 +134,7 @@ def solve_meshes(
     record = _from_guess(record, problem, method, grid, guess, settings)
     if refine is None:
         return record
+    record.refines = True
     for _ in range(_STARTS - 1):
         if record.outcome.ending not in _NOT_SO_FINE or grid.intervals > _MOST_COARSE:
             break
