@@ -103,8 +103,10 @@ def combined(first: Chosen, then: Chosen, names: Sequence[str]) -> Chosen:
     """What two choices say together of some inputs: the first goes before, name by name."""
     if isinstance(first, str):
         return first
-    rest = dict.fromkeys(names, then) if isinstance(then, str) else then
-    return {**(rest or {}), **(first or {})} or None
+    rest: Mapping[str, Between] | None
+    rest = {name: then for name in names} if isinstance(then, str) else then
+    both: dict[str, Between] = {**(rest or {}), **(first or {})}
+    return both or None
 
 
 def parse_chosen(text: str | None) -> Chosen:

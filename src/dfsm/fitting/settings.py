@@ -130,7 +130,9 @@ class FitSettings:
         _ = resolved(self.inputs, (*self.controls, *self.driving))
         for feature in self.features:
             # What acted before now is known; optimal control refuses it, see `acting_late`.
-            free: set[Role] = {_DISTURBANCE} | ({"control"} if feature.kind == "delay" else set())
+            free: tuple[Role, ...] = (_DISTURBANCE,)
+            if feature.kind == "delay":
+                free = (_DISTURBANCE, "control")
             source = next(
                 (n for n in feature.sources if roles.get(n, _DISTURBANCE) not in free), None
             )

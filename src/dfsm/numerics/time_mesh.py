@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from dfsm.core.shapes import Series
 
@@ -160,10 +160,12 @@ def std_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
     return np.sqrt(mean_over((values - mean_over(values, weights)) ** 2, weights))
 
 
-def quantiles_over(values: Series, at: ArrayLike, weights: Series | None) -> np.ndarray:
+def quantiles_over(
+    values: Series, at: float | Sequence[float] | np.ndarray, weights: Series | None
+) -> np.ndarray:
     """Quantiles of samples ``(sample,)`` at shares of their number, or of their weight."""
     if weights is None:
-        return np.quantile(values, at)
+        return np.quantile(values, np.asarray(at))
     order = np.argsort(values, kind="stable")
     weight = weights[order]
     share = (np.cumsum(weight) - weight / 2) / weight.sum()

@@ -6,6 +6,7 @@ Imported only where such a solver is asked for: diffrax takes a second to load.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import diffrax
@@ -44,13 +45,13 @@ class EndingAtBends(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
         return self.controller.atol
 
     @property
-    def norm(self) -> Callable[[Any], Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def norm(self) -> Callable[[Any], Any]:  # pyright: ignore
         """Norm of errors."""
         return self.controller.norm
 
     def wrap(self, direction: Any) -> EndingAtBends:
         """Nothing to turn round: rollouts go forwards."""
-        return EndingAtBends(self.controller.wrap(direction), self.begins, self.ends)
+        return replace(self, controller=self.controller.wrap(direction))
 
     def _cut(self, t0: jax.Array, t1: jax.Array) -> jax.Array:
         """End of a step from t0 that shall reach t1."""

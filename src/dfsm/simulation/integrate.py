@@ -385,7 +385,7 @@ def _adapt(
 
     spread = model.region.std[model.signals.state_columns]
     spread = jnp.where(spread > 0, spread, 1.0)
-    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, inputs(t)) / spread)
+    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, inputs(jnp.asarray(t))) / spread)
     solution = diffrax.diffeqsolve(
         term,
         diffrax.Tsit5() if method == "tsit5" else diffrax.Kvaerno5(),
@@ -395,7 +395,11 @@ def _adapt(
         # Scaled by their spread all states share one absolute tolerance.
         y0=x0 / spread,
         saveat=diffrax.SaveAt(ts=samples),
-        stepsize_controller=EndingAtBends(diffrax.PIDController(rtol=rtol, atol=atol), *bends),
+        stepsize_controller=EndingAtBends(  # its fields; diffrax's bases are abstract
+            controller=diffrax.PIDController(rtol=rtol, atol=atol),  # pyright: ignore[reportCallIssue]
+            begins=bends[0],
+            ends=bends[1],
+        ),
         max_steps=_MAX_STEPS,
         throw=False,
     )
