@@ -13,23 +13,26 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
+from dfsm.cli.simulate import simulate
 from dfsm.cli.terminal import (
     AsJson,
     Files,
     Interpolation,
+    IntervalFile,
     Method,
     ParameterFile,
     Quiet,
     SampleStep,
     Step,
     as_in_fit,
+    exit_if_ended,
     fit_start,
     lines,
     marching,
@@ -41,10 +44,7 @@ from dfsm.cli.terminal import (
 )
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
-from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
-
-if TYPE_CHECKING:
-    from dfsm.simulation.simulate import Simulation
+from dfsm.errors import DfsmError, DfsmWarning, printable
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -57,15 +57,12 @@ demos = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Studies that bring their own simulations."
 )
 app.add_typer(demos, name="demo")
+app.command()(simulate)
 app.command()(optimize)
 app.command("export-rosco")(export_rosco)
 app.command("check-run")(check_run)
 app.command()(calibrate)
 app.command()(wind)
-
-IntervalFile = Annotated[
-    Path | None, typer.Option("--intervals", help="Prediction intervals made by dfsm calibrate.")
-]
 
 
 @app.command()
@@ -280,83 +277,9 @@ def validate(
         print_validation(validation)
     for path in targets:
         say(f"wrote {path}", quiet)
-    _exit_if_ended(
+    exit_if_ended(
         [r.models[m].simulation for r in validation.runs for m in ("multi-fidelity",)], quiet
     )
-
-
-@app.command()
-def simulate(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
-    run: Annotated[str, typer.Argument(help="File with the inputs and the initial state.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
-    start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
-    stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
-    method: Method = "rk4",
-    step: Step = None,
-    interpolation: Interpolation = None,
-    intervals: IntervalFile = None,
-    parameters: ParameterFile = None,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option("--set", help='Change a channel: "NAME = 2", or +=, -=, *=; run\'s units.'),
-    ] = None,
-    inputs: Annotated[
-        str | None, typer.Option(help="Table whose columns replace inputs of the run.")
-    ] = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> None:
-    """Simulate the model with the inputs of one run, or others, and write states and outputs."""
-    from dfsm.core.fallback import write_or_keep
-    from dfsm.core.files import check_file
-    from dfsm.data.readers import read
-    from dfsm.data.readers.tables import table_suffix, write_table
-    from dfsm.models.completion import completed
-    from dfsm.models.model_folder import load
-    from dfsm.models.what_if import with_changes, with_inputs
-    from dfsm.simulation.simulate import simulate as run_simulate
-    from dfsm.validation.intervals import load_intervals
-
-    settings = marching(method, step, interpolation)
-    table_suffix(output)
-    check_file(output, [path for path in (run, inputs, intervals) if path and Path(path).exists()])
-    surrogate = load(model)
-    start = fit_start(surrogate) if start is None else start
-    calibrated = None if intervals is None else load_intervals(intervals)
-    if calibrated is not None:
-        calibrated.check(surrogate)
-    with working(quiet):
-        (recorded,) = as_in_fit(surrogate, parametrized([read(run, step)], parameters))
-        tell_notes([recorded], quiet)
-        if inputs is not None:
-            recorded = with_inputs(recorded, read(inputs), surrogate.signals, start, stop)
-        recorded = with_changes(recorded, changes or (), surrogate.signals)
-        recorded = completed(recorded, surrogate.signals)
-    with working(quiet), hushed():  # the outcome is printed below
-        result = run_simulate(
-            surrogate,
-            recorded,
-            start=start,
-            stop=stop,
-            settings=settings,
-        )
-    table = result.trajectory if calibrated is None else calibrated.beside(result, recorded)
-    write_or_keep(lambda path: write_table(table, path), output)
-    if as_json:
-        print_json(
-            {
-                "status": result.status.name.lower(),
-                "message": result.message,
-                "ended_s": result.ended,
-                "outside": result.outside,
-                "wall_time_s": result.wall_time,
-                "output": str(output),
-            }
-        )
-    else:
-        say(f"wrote {output} ({len(result.trajectory)} samples): {result.message}", quiet)
-    _exit_if_ended([result], quiet or as_json)
 
 
 @demos.command("two-link-robot")
@@ -465,16 +388,6 @@ def _unexpected(error: Exception) -> int:
 def _fail(message: str, code: int) -> int:
     print(printable(message), file=sys.stderr)
     return code
-
-
-def _exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:
-    from dfsm.simulation.simulate import Status
-
-    ended = [s for s in simulations if s.status is not Status.COMPLETED]
-    if ended:
-        if not quiet:
-            print(f"{len(ended)} of {len(simulations)} simulations ended early", file=sys.stderr)
-        raise typer.Exit(1)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:

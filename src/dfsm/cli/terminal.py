@@ -17,7 +17,7 @@ from dfsm.errors import DfsmError, hushed, printable
 if TYPE_CHECKING:
     from dfsm.data.trajectory import Trajectory
     from dfsm.models.dfsm import DFSM
-    from dfsm.simulation.simulate import SimulationSettings
+    from dfsm.simulation.simulate import Simulation, SimulationSettings
 
 Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
@@ -26,6 +26,9 @@ SampleStep = Annotated[
     typer.Option("--step", help="Interval between samples in s, for files without times."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+IntervalFile = Annotated[
+    Path | None, typer.Option("--intervals", help="Prediction intervals made by dfsm calibrate.")
+]
 ParameterFile = Annotated[
     Path | None, typer.Option("--parameters", help="CSV: a column of runs, one per parameter.")
 ]
@@ -111,3 +114,14 @@ def print_json(value: Any) -> None:
     """Print a value that strict JSON can hold."""
     # ASCII, so that it is JSON in every terminal's encoding.
     typer.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def exit_if_ended(simulations: list[Simulation], quiet: bool) -> None:
+    """Leave with exit code 1 where a simulation ended early, and say how many did."""
+    from dfsm.simulation.simulate import Status
+
+    ended = [s for s in simulations if s.status is not Status.COMPLETED]
+    if ended:
+        if not quiet:
+            print(f"{len(ended)} of {len(simulations)} simulations ended early", file=sys.stderr)
+        raise typer.Exit(1)

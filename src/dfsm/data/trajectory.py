@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, missing, printable
-from dfsm.numerics.time_mesh import own_interval, time_step
+from dfsm.numerics.time_mesh import instants_apart, own_interval, time_step
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,7 +109,7 @@ class Trajectory:
             )
         if len(time) < 2:
             raise DfsmError(f"{self.where}: {len(time)} samples, at least 2 are needed")
-        time = _apart(time, values)
+        time = instants_apart(time, values)
         _check_time(time, self.where)
         counts: dict[str, int] = {}
         for c in self.channels:
@@ -430,22 +430,6 @@ def _samples(run: Trajectory, values: ArrayLike, channels: Sequence[Channel]) ->
             "one number"
         )
     return samples.reshape(shape) if samples.ndim else np.full(shape, samples)
-
-
-def _apart(time: Array, values: Array) -> Array:
-    """Move the second of two samples at one time on by the smallest step there is.
-
-    An event is written as two samples, before and after inputs jump; what does not jump is the same
-    in both. Two samples that have nothing in common, three at one time, or copies of samples in a
-    run without events are something else.
-    """
-    rows = np.flatnonzero(np.diff(time) == 0) + 1
-    same = values[rows] == values[rows - 1]
-    if same.all():
-        return time
-    pairs = rows[(np.diff(rows, prepend=-2) > 1) & same.any(axis=1)]
-    time[pairs] = np.nextafter(time[pairs], np.inf)
-    return time
 
 
 def _check_time(time: Array, where: str) -> None:

@@ -196,3 +196,19 @@ def same_instant(time: Series) -> np.ndarray:
     if single < _SHARE * usual and np.array_equal(time.astype(np.float32), time):
         limit = max(limit, single)
     return steps <= limit
+
+
+def instants_apart(time: Series, values: np.ndarray) -> Series:
+    """Move the second of two samples at one time on by the smallest step there is.
+
+    An event is written as two samples, before and after inputs jump; what does not jump is the same
+    in both. Two samples that have nothing in common, three at one time, or copies of samples in a
+    run without events are something else.
+    """
+    rows = np.flatnonzero(np.diff(time) == 0) + 1
+    same = values[rows] == values[rows - 1]
+    if same.all():
+        return time
+    pairs = rows[(np.diff(rows, prepend=-2) > 1) & same.any(axis=1)]
+    time[pairs] = np.nextafter(time[pairs], np.inf)
+    return time
