@@ -26,10 +26,12 @@ from dfsm.models.corrective import GaussianUnits, Perceptron
 from dfsm.models.model_folder import load
 from dfsm.models.signals import Provenance
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Stop
+from dfsm.refinement import trial
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.refine import RefineSettings, refine
+from dfsm.refinement.refine import refine
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.settings import RefineSettings
 from dfsm.refinement.slopes import sensitivities, spread_steps
 from dfsm.refinement.start import start_network
 from dfsm.simulation.simulate import simulate
@@ -184,7 +186,7 @@ def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monk
         def __iter__(self):
             return iter(())
 
-    monkeypatch.setattr(sys.modules[refine.__module__], "LevenbergMarquardt", Nothing)
+    monkeypatch.setattr(trial, "LevenbergMarquardt", Nothing)
     with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
         result = refine(biased, runs, CHOICES)
     assert result.model is biased

@@ -43,7 +43,8 @@ from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
 from dfsm.models.stability import destabilised
-from dfsm.refinement.refine import RefineSettings, refine
+from dfsm.refinement.refine import refine
+from dfsm.refinement.settings import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
 
 # Training runs that are simulated to check a new model, and those of them along which pairs of

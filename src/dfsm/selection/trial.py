@@ -22,7 +22,7 @@ from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import with_computed
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.refine import RefineSettings
+from dfsm.refinement.settings import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
 from dfsm.validation.results import ChannelError, spread
 
