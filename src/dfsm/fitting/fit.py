@@ -209,6 +209,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])
     L[:, fitted], b[:, fitted] = result.model.coefficients, result.model.offsets
+    b[:, [fitted[row] for row in known.balances]] = 0.0
     rms, std = np.zeros(L.shape[1]), samples.derivatives.std(axis=0)
     rms[fitted] = result.residual_rms
     for row, rate in kinematic.items():

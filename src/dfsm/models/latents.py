@@ -12,7 +12,7 @@ evaluates a model treats them like any other state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
+from dfsm.models.terms import Terms
 
 # Before the record begins, the inputs are taken to have been what they were on average over this.
 _REST = 20.0  # s
@@ -208,7 +209,13 @@ def rest(time: Array, inputs: Array) -> Array:
 # -- adding them to a model ---------------------------------------------------------------------
 
 
-def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[Array]) -> DFSM:
+def add_latents(
+    model: DFSM,
+    dynamics: Poles,
+    coupling: Array,
+    paths: Sequence[Array],
+    gains: Mapping[int, Array] | None = None,
+) -> DFSM:
     """A model with latent states in addition.
 
     Parameters
@@ -222,6 +229,9 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         ``(state, 2 pair)``.
     paths
         Their values along the training runs, each ``(time, 2 pair)``.
+    gains
+        What one unit of each adds to the first signal of some known terms, by the term's place,
+        ``(2 pair,)``.
     """
     s, count = model.signals, coupling.shape[1]
     at, n = s.state_columns.stop, len(s.states)
@@ -232,7 +242,16 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         b = np.pad(np.asarray(linear.offsets), ((0, 0), (0, extra_rows)))
         if extra_rows:
             L[:, :n, at : at + count] = coupling
-        return replace(linear, coefficients=jnp.asarray(L), offsets=jnp.asarray(b))
+        known = [(row, c + count if c >= at else c) for row, c in linear.known]
+        if extra_rows:
+            # Where all is known, latent states add nothing.
+            known += [(row, c) for row in linear.complete for c in range(at, at + count)]
+        return replace(
+            linear,
+            coefficients=jnp.asarray(L),
+            offsets=jnp.asarray(b),
+            known=tuple(sorted(known)),
+        )
 
     f = wider(model.f, count)
     names = tuple(Channel(f"latent{k + 1}", "-") for k in range(count))
@@ -246,9 +265,17 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         corrected_outputs=model.corrected_outputs,
         signals=replace(s, states=(*s.states, *names), latents=names),
         provenance=model.provenance,
-        terms=None if model.terms is None else model.terms.with_more_inputs(at, count),
+        terms=None if model.terms is None else _terms(model.terms, at, names, gains or {}),
     )
     return with_poles(wide, dynamics)
+
+
+def _terms(terms: Terms, at: int, names: Sequence[Channel], gains: Mapping[int, Array]) -> Terms:
+    wide = terms.with_more_inputs(at, len(names))
+    parts = list(wide.parts)
+    for place, weights in gains.items():
+        parts[place] = parts[place].with_latents([c.name for c in names], at, weights)
+    return replace(wide, parts=tuple(parts))
 
 
 def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:

@@ -33,6 +33,22 @@ class LinearModel(eqx.Module):
     schedule: int | None = eqx.field(static=True)
     known: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
+    @property
+    def complete(self) -> tuple[int, ...]:
+        """Targets all of whose coefficients are known."""
+        targets, width = self.coefficients.shape[1:]
+        counts = [sum(t == target for t, _ in self.known) for target in range(targets)]
+        return tuple(target for target, count in enumerate(counts) if count == width)
+
+    def hidden_among(self, inputs: int) -> tuple[int, ...]:
+        """Which of the first columns no corrective function may take, lest it undo what is known.
+
+        Targets all of whose coefficients are known are not corrected, and do not count.
+        """
+        complete = self.complete
+        places = {c for target, c in self.known if c < inputs and target not in complete}
+        return tuple(sorted(places))
+
     def known_among(self, inputs: int) -> tuple[int, ...]:
         """Which of the first columns have a coefficient that is known."""
         return tuple(sorted({column for _, column in self.known if column < inputs}))

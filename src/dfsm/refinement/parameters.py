@@ -34,7 +34,7 @@ class Parametrization(eqx.Module):
     model
         The model at zero.
     rows
-        Rows of the linear fit that are neither kinematic nor of latent states.
+        Rows of the linear fit that are neither kinematic nor of latent states nor wholly known.
     spread
         Typical size of each of these derivatives, shape ``(row,)``, in its unit.
     scheduled, constant
@@ -57,7 +57,7 @@ class Parametrization(eqx.Module):
     def of(cls, model: DFSM, spread: Array) -> Parametrization:
         """Make one; `spread` holds the typical size of the observed states' derivatives."""
         s = model.signals
-        known = kinematic_rows(s.specs)
+        known = {*kinematic_rows(s.specs), *model.f.complete}
         rows = tuple(i for i in range(len(s.observed)) if i not in known)
         L = np.asarray(model.f.coefficients)[:, list(rows)]
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)

@@ -49,6 +49,25 @@ class Term(eqx.Module):
         """The same term where I has `count` more inputs from column `at` on."""
         return replace(self, columns=tuple(c + count if c >= at else c for c in self.columns))
 
+    @property
+    def driven(self) -> int | None:
+        """Column in I of a state whose row of the linear fit is known because of this term."""
+        return None
+
+    def with_latents(self, names: Sequence[str], first: int, gains: Array) -> Self:  # noqa: ARG002
+        """The same term where latent states reach the state that it drives through it alone.
+
+        Parameters
+        ----------
+        names
+            Of the latent states.
+        first
+            Column in I of the first of them.
+        gains
+            Their effect at first, in the unit of the term's first signal, shape ``(latent,)``.
+        """
+        return self
+
     # -- data -----------------------------------------------------------------------------------
 
     def check(self, values: Mapping[str, Array]) -> list[str]:  # noqa: ARG002

@@ -329,6 +329,39 @@ class RotorTerm(Term):
         within = (wind > 0) & (speed >= low * wind) & (speed <= high * wind)
         return ~(within & (pitch >= first) & (pitch <= last))
 
+    # -- latent states --------------------------------------------------------------------------
+
+    @property
+    def driven(self) -> int | None:
+        """Column in I of the state that answers to nothing but torques; None if not known."""
+        return None if self.about.inertia is None else self.columns[1]
+
+    def with_latents(self, names: Sequence[str], first: int, gains: Array) -> RotorTerm:
+        """The term of a model whose latent states change the wind that the rotor feels.
+
+        What the air remembers, the wake that settles after the blades have pitched, reaches the
+        rotor as another wind; so neither thrust nor torque exceed what the table has.
+
+        Parameters
+        ----------
+        names
+            Of the latent states.
+        first
+            Column in I of the first of them.
+        gains
+            What one unit of each adds to the wind, in m/s, shape ``(latent,)``.
+        """
+        columns = (*self.columns, *range(first, first + len(names)))
+        # A latent state is about one; this much of it is about as large as turbulence.
+        scale = jnp.ones(len(names))
+        return replace(
+            self,
+            columns=columns,
+            gains=jnp.concatenate([self.gains, jnp.asarray(gains)]),
+            scale=jnp.concatenate([self.scale, scale]),
+            about=replace(self.about, inputs=(*self.about.inputs, *names)),
+        )
+
     # -- what the fit knows of it -----------------------------------------------------------------
 
     @property
