@@ -86,7 +86,7 @@ def correct(
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     derivatives = targets is samples.derivatives
     known = kinematic_rows(settings.states) if derivatives else {}
-    mechanics = set(linear.model.complete) - set(known)
+    mechanics = set(linear.model.complete()) - set(known)
     large = [
         i
         for i in range(targets.shape[1])

@@ -75,7 +75,12 @@ def known_coefficients(
             place = row, _column(names, name, f"known.{state}")
             fixed[place] = float(value)
             first.pop(place, None)
-    return KnownCoefficients(fixed, first, tuple(rows[state] for state in mechanics))
+    balances = tuple(
+        rows[s.speed]
+        for s in settings.terms
+        if isinstance(s, Rotor) and s.memory == "wind" and s.speed in mechanics
+    )
+    return KnownCoefficients(fixed, first, balances)
 
 
 def _row(rows: Mapping[str, int], state: str, key: str) -> int:

@@ -27,6 +27,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.terms import Terms
+from dfsm.models.terms.form import Schedule
 
 # Before the record begins, the inputs are taken to have been what they were on average over this.
 _REST = 20.0  # s
@@ -244,10 +245,12 @@ def add_latents(
             L[:, :n, at : at + count] = coupling
         known = [(row, c + count if c >= at else c) for row, c in linear.known]
         if extra_rows:
-            # Where all is known, latent states add nothing.
-            known += [(row, c) for row in linear.complete for c in range(at, at + count)]
+            # They reach a balance of known torques through its term.
+            known += [(row, c) for row in model.balances for c in range(at, at + count)]
+        schedule = linear.schedule
         return replace(
             linear,
+            schedule=schedule + count if schedule is not None and schedule >= at else schedule,
             coefficients=jnp.asarray(L),
             offsets=jnp.asarray(b),
             known=tuple(sorted(known)),
@@ -265,16 +268,22 @@ def add_latents(
         corrected_outputs=model.corrected_outputs,
         signals=replace(s, states=(*s.states, *names), latents=names),
         provenance=model.provenance,
-        terms=None if model.terms is None else _terms(model.terms, at, names, gains or {}),
+        terms=_terms(model, at, names, gains or {}),
     )
     return with_poles(wide, dynamics)
 
 
-def _terms(terms: Terms, at: int, names: Sequence[Channel], gains: Mapping[int, Array]) -> Terms:
-    wide = terms.with_more_inputs(at, len(names))
-    parts = list(wide.parts)
+def _terms(
+    model: DFSM, at: int, names: Sequence[Channel], gains: Mapping[int, Array]
+) -> Terms | None:
+    if model.terms is None:
+        return None
+    wide, column = model.terms.with_more_inputs(at, len(names)), model.f.schedule
+    if column is not None and column >= at:
+        column += len(names)
+    schedule, parts = Schedule(column, np.asarray(model.f.grid)), list(wide.parts)
     for place, weights in gains.items():
-        parts[place] = parts[place].with_latents([c.name for c in names], at, weights)
+        parts[place] = parts[place].with_latents([c.name for c in names], at, weights, schedule)
     return replace(wide, parts=tuple(parts))
 
 

@@ -107,7 +107,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         Predicts what it did before. Inputs whose effect is known from physics are
         hidden from the network.
     """
-    rows = Parametrization.of(model, spread).rows
+    known = model.f.complete(model.signals.latent_columns)
+    rows = tuple(r for r in Parametrization.of(model, spread).rows if r not in known)
     rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
     directions = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
     network = Perceptron(
@@ -116,7 +117,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
-    return replace(model, e=network.ignoring(model.f.hidden_among(inputs)), corrected=rows)
+    hidden = model.f.hidden_among(inputs, model.signals.latent_columns)
+    return replace(model, e=network.ignoring(hidden), corrected=rows)
 
 
 def _through_terms(model: DFSM, records: Sequence[Record], coupling: Array) -> dict[int, Array]:
@@ -146,8 +148,7 @@ def _through_terms(model: DFSM, records: Sequence[Record], coupling: Array) -> d
     for place, term in enumerate(model.terms.parts):
         columns = slice(value, value + len(term.channels))
         value = columns.stop
-        row = None if term.driven is None else term.driven - inputs
-        if row is None or row not in model.f.complete:
+        if term.driven is None or (row := term.driven - inputs) not in model.balances:
             continue
         # Per unit of the signal, in every row.
         effect = L[:, columns] @ slopes[columns.start - first : columns.stop - first]
