@@ -21,6 +21,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.start import start_latents
 from systems import wander
 
 TABLE = Path(__file__).parents[1] / "examples" / "iea15" / "Cp_Ct_Cq.IEA15MW.txt"
@@ -266,9 +267,20 @@ def test_what_reaches_the_rotor_is_learnt_from_rollouts(started, turbines):
     assert errors[0] > 3 * errors[1]
 
 
-def test_slopes_through_terms_agree_with_differences(started, turbines):
+@pytest.fixture(scope="module")
+def remembering(turbines) -> dfsm.DFSM:
+    """As `started`, with latent states that change the wind."""
+    settings = replace(SPINNING, terms=(replace(ROTOR, memory="wind"),))
+    with hushed():
+        return dfsm.fit(turbines[:2], settings).model
+
+
+@pytest.mark.parametrize("latents", [0, 2])
+def test_slopes_through_terms_agree_with_differences(started, remembering, turbines, latents):
     record = record_of(started, turbines[0], 0.5, 0.0, 60.0)
-    parameters = Parametrization.of(started, np.array([0.05, 0.02, 0.05]))
+    spread = np.array([0.05, 0.02, 0.05])
+    model = start_latents(remembering, [record], latents, spread) if latents else started
+    parameters = Parametrization.of(model, spread)
     problem = RolloutError(parameters, [[record]], None, ErrorWeights(np.ones(3)))
     at = 0.003 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)
@@ -278,17 +290,24 @@ def test_slopes_through_terms_agree_with_differences(started, turbines):
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-4, atol=1e-5 * np.abs(slopes).max())
 
 
-def test_latent_states_beside_terms(started, turbines):
+def test_latent_states_change_the_wind_at_a_rotor_of_known_inertia(remembering, turbines):
     settings = dfsm.RefineSettings(windows=(50.0,), step=1.0, iterations=1, latents=2, hold_out=0.4)
     with hushed():
-        refined = dfsm.refine(started, turbines[:2], settings).model
+        refined = dfsm.refine(remembering, turbines[:2], settings).model
         rollout = dfsm.simulate(refined, turbines[2])
-    assert refined.signals.latents
-    taken = [
-        [m.signals.order.names[c] for c in m.terms.parts[0].columns] for m in (started, refined)
-    ]
-    assert taken[0] == taken[1] == list(ROTOR.inputs)
     assert rollout.status is dfsm.Status.COMPLETED
+    rotor = refined.terms.parts[0]
+    taken = [refined.signals.order.names[c] for c in rotor.columns]
+    # The last column is the schedule's, of which a model with one point has none.
+    assert taken[:-1] == [*ROTOR.inputs, "latent1", "latent2"]
+    assert np.all(np.asarray(rotor.late)[0, :2] != 0)
+    # What mechanics knows of the speed is the same, and nothing is added to it.
+    names = [c.name for c in (*refined.signals.inputs, *refined.terms.channels)]
+    row = dict(zip(names, np.asarray(refined.f.coefficients)[0, 1], strict=True))
+    assert row.pop("Torque") == pytest.approx(BRAKING)
+    assert row.pop("rotor.torque") == pytest.approx(-BRAKING)
+    assert set(row.values()) == {0.0}
+    assert float(refined.f.offsets[0, 1]) == 0.0
 
 
 # -- configuration --------------------------------------------------------------------------------

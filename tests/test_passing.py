@@ -23,7 +23,7 @@ from dfsm.models.passing import field_harmonics, harmonics_of
 from dfsm.models.signals import Azimuth
 from dfsm.numerics.fatigue import damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
-from dfsm.refinement.refine import RefineSettings
+from dfsm.refinement.settings import RefineSettings
 from dfsm.simulation.simulate import SimulationSettings, Status, simulate
 from dfsm.validation.validate import validate
 

@@ -16,6 +16,7 @@ from scipy.signal import lsim
 
 from conftest import changed, write_config
 from dfsm.data.derivatives import StateSpec
+from dfsm.data.hold_out import HoldOut
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.corrective import NoCorrection
@@ -26,10 +27,12 @@ from dfsm.models.corrective import GaussianUnits, Perceptron
 from dfsm.models.model_folder import load
 from dfsm.models.signals import Provenance
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Stop
+from dfsm.refinement import trial
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.refine import RefineSettings, refine
+from dfsm.refinement.refine import refine
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.settings import RefineSettings
 from dfsm.refinement.slopes import sensitivities, spread_steps
 from dfsm.refinement.start import start_network
 from dfsm.simulation.simulate import simulate
@@ -179,12 +182,27 @@ def test_runs_with_the_same_disturbances_show_what_controls_do():
     assert not set(record["validation"]) & set(record["training"])
 
 
+def test_runs_are_held_out_several_times_and_then_all_train(runs, biased):
+    settings = replace(CHOICES, windows=(5.0,), iterations=3, hold_out=HoldOut(share=0.3, splits=2))
+    result = refine(biased, runs, settings)
+    assert result.improved
+    assert len(result.splits) == 2
+    assert np.mean(result.splits, axis=0) == pytest.approx([result.before, result.after])
+    splits = result.model.provenance.record["refinement"]["splits"]
+    assert splits[0]["validation"] != splits[1]["validation"]
+    assert "held out 2 times" in result.message
+    # Steps on all runs, from the start; as many as were best.
+    last = [entry["training"] for entry in result.history if "split" not in entry]
+    assert 1 <= len(last) <= 3
+    assert float(result.model.f.coefficients[0, 1, 2]) == pytest.approx(-0.6, abs=0.15)
+
+
 def test_where_refinement_does_not_help_the_start_is_returned(runs, biased, monkeypatch):
     class Nothing(LevenbergMarquardt):
         def __iter__(self):
             return iter(())
 
-    monkeypatch.setattr(sys.modules[refine.__module__], "LevenbergMarquardt", Nothing)
+    monkeypatch.setattr(trial, "LevenbergMarquardt", Nothing)
     with pytest.warns(DfsmWarning, match="refinement did not lower the error"):
         result = refine(biased, runs, CHOICES)
     assert result.model is biased

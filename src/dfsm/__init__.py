@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from dfsm.data.dataset import Dataset
     from dfsm.data.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
     from dfsm.data.features import Feature
+    from dfsm.data.hold_out import HoldOut
     from dfsm.data.info import describe
     from dfsm.data.readers import read, read_all
     from dfsm.data.readers.mann import BoxSettings, read_mann
@@ -54,7 +55,8 @@ if TYPE_CHECKING:
     from dfsm.models.signals import Azimuth
     from dfsm.models.steady import SteadyState, steady_state
     from dfsm.models.terms import Function, Product, QuadraticDrag, Rotor
-    from dfsm.refinement.refine import RefineResult, RefineSettings, refine
+    from dfsm.refinement.refine import RefineResult, refine
+    from dfsm.refinement.settings import RefineSettings
     from dfsm.report import write_report, write_solution_report
     from dfsm.selection.compare import RankedCandidate, Ranking, compare
     from dfsm.selection.trial import Candidate, Outcome
@@ -107,6 +109,7 @@ _HOME = {
     "DerivativeSettings": "data.derivatives",
     "differentiate": "data.derivatives",
     "Feature": "data.features",
+    "HoldOut": "data.hold_out",
     "LTI": "fitting.linear",
     "LPV": "fitting.linear",
     "RBF": "fitting.corrective.rbf",
@@ -131,7 +134,7 @@ _HOME = {
     "FitSettings": "fitting.settings",
     "FitResult": "fitting.fit",
     "fit": "fitting.fit",
-    "RefineSettings": "refinement.refine",
+    "RefineSettings": "refinement.settings",
     "RefineResult": "refinement.refine",
     "refine": "refinement.refine",
     "save": "models.model_folder",

@@ -15,6 +15,7 @@ from dfsm.core.settings import require
 from dfsm.data.between import Between
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
+from dfsm.data.hold_out import HoldOut, checked
 from dfsm.data.parameters import Table, names_in, read_parameters, with_parameters
 from dfsm.data.readers import read_all
 from dfsm.data.slower import Slower
@@ -26,7 +27,7 @@ from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
 from dfsm.models.terms import Rotor, TermSettings
-from dfsm.refinement.refine import RefineSettings
+from dfsm.refinement.settings import RefineSettings
 from dfsm.selection.compare import HOLD_OUT, check_candidates
 from dfsm.selection.trial import Candidate
 
@@ -110,19 +111,18 @@ class CompareConfig(Strict):
     candidates
         By name the keys that each of them changes; the configuration itself is called base.
     hold_out
-        Share of the training runs that rank the candidates.
+        Share of the training runs that rank the candidates, or a `HoldOut` of one split.
     validation
         Files that rank them instead; those among the training files are not trained with.
     """
 
     candidates: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    hold_out: float = HOLD_OUT
+    hold_out: float | HoldOut = HOLD_OUT
     validation: list[str] | None = None
 
     def model_post_init(self, _: Any, /) -> None:
         """Check what types cannot."""
-        share = "a share between 0 and 1"
-        require(0 < self.hold_out < 1, "compare.hold_out", self.hold_out, share)
+        checked(self.hold_out, "compare.hold_out")
         both = self.validation is not None and "hold_out" in self.model_fields_set
         require(not both, "compare.hold_out", self.hold_out, "no value beside compare.validation")
         files = self.validation is None or bool(self.validation)

@@ -47,7 +47,8 @@ from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
 from dfsm.models.stability import destabilised
 from dfsm.numerics.time_mesh import mean_over, std_over
-from dfsm.refinement.refine import RefineSettings, refine
+from dfsm.refinement.refine import refine
+from dfsm.refinement.settings import RefineSettings
 
 
 @dataclass(frozen=True)
@@ -221,6 +222,7 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])
     L[:, fitted], b[:, fitted] = result.model.coefficients, result.model.offsets
+    b[:, [fitted[row] for row in known.balances]] = 0.0
     rms, std = np.zeros(L.shape[1]), std_over(samples.derivatives, samples.weights)
     rms[fitted] = result.residual_rms
     for row, rate in kinematic.items():

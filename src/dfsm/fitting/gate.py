@@ -88,8 +88,13 @@ def correct(
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     derivatives = targets is samples.derivatives
     known = kinematic_rows(settings.states) if derivatives else {}
-    large = [i for i in range(targets.shape[1]) if i not in known and ratio[i] > settings.gate]
-    hidden, trained = linear.model.known_among(samples.inputs.shape[1]), None
+    mechanics = set(linear.model.complete()) - set(known)
+    large = [
+        i
+        for i in range(targets.shape[1])
+        if i not in known and i not in mechanics and ratio[i] > settings.gate
+    ]
+    hidden, trained = linear.model.hidden_among(samples.inputs.shape[1]), None
     if large and not later:
         inputs = samples.without_terms(inputs)
         trained = _train(inputs, residuals[:, large], hidden, samples, settings)
@@ -106,6 +111,8 @@ def correct(
     for i, (name, unit) in enumerate(_target_names(samples, derivatives)):
         if i in known:
             text = "kinematic, its rate is a state"
+        elif i in mechanics:
+            text = f"mechanics, residual {ratio[i]:.1%} of the signal"
         elif ratio[i] <= settings.gate:
             text = f"linear fit, residual {ratio[i]:.1%} of the signal (gate {settings.gate:.1%})"
         elif i in large:

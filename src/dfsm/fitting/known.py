@@ -22,10 +22,13 @@ class KnownCoefficients:
         Never changed.
     first
         Where refinement on rollouts begins.
+    balances
+        Fitted rows that are a balance of known torques, to which no offset is added.
     """
 
     fixed: Mapping[tuple[int, int], float]
     first: Mapping[tuple[int, int], float]
+    balances: tuple[int, ...] = ()
 
 
 def known_coefficients(
@@ -52,13 +55,17 @@ def known_coefficients(
         spec.name: list(fitted).index(rates.get(i, i)) for i, spec in enumerate(settings.states)
     }
     names = samples.linear_names
-    known, only = _mechanics(samples, settings)
-    known = {**known, **settings.linear.known}
-    only = {**only, **settings.linear.only}
+    mechanics = _mechanics(samples, settings)
+    known = {**mechanics, **settings.linear.known}
     fixed, first = dict[tuple[int, int], float](), dict[tuple[int, int], float]()
     for name in (n for s in settings.terms if isinstance(s, Rotor) for n in s.corrections):
         fixed.update({(row, names.index(name)): 0.0 for row in rows.values()})
-    for state, inputs in only.items():
+    for state in mechanics:
+        # In closed loop torque and blade pitch follow the speed, and least squares on derivatives
+        # would take that for a property of the rotor.
+        row = _row(rows, state, "known")
+        fixed.update({(row, c): 0.0 for c in range(len(names))})
+    for state, inputs in settings.linear.only.items():
         row = _row(rows, state, "only")
         columns = [_column(names, n, f"only.{state}") for n in inputs]
         first.update({(row, c): 0.0 for c in range(len(names)) if c not in columns})
@@ -68,10 +75,12 @@ def known_coefficients(
             place = row, _column(names, name, f"known.{state}")
             fixed[place] = float(value)
             first.pop(place, None)
-    for place, value in _aerodynamics(samples, settings, rows).items():
-        if place not in fixed:
-            first[place] = value
-    return KnownCoefficients(fixed, first)
+    balances = tuple(
+        rows[s.speed]
+        for s in settings.terms
+        if isinstance(s, Rotor) and s.memory == "wind" and s.speed in mechanics
+    )
+    return KnownCoefficients(fixed, first, balances)
 
 
 def _row(rows: Mapping[str, int], state: str, key: str) -> int:
@@ -94,41 +103,14 @@ def _column(names: Sequence[str], name: str, key: str) -> int:
 # -- rotors of known inertia, J ω̇ = Q - τ ---------------------------------------------------------
 
 
-def _rotors(samples: Samples, settings: FitSettings) -> list[tuple[Rotor, RotorTerm]]:
+def _mechanics(samples: Samples, settings: FitSettings) -> dict[str, dict[str, float]]:
+    """What the torques of rotor and generator do to a rotor's speed, by state; all that does."""
+    known = dict[str, dict[str, float]]()
     parts = () if samples.terms is None else samples.terms.parts
-    pairs = zip(settings.terms, parts, strict=True)
-    return [
-        (s, t)
-        for s, t in pairs
-        if isinstance(s, Rotor) and isinstance(t, RotorTerm) and s.inertia is not None
-    ]
-
-
-def _mechanics(
-    samples: Samples, settings: FitSettings
-) -> tuple[dict[str, dict[str, float]], dict[str, tuple[str, ...]]]:
-    """What the generator's torque does, and that a rotor's speed answers to both torques alone.
-
-    In closed loop torque and blade pitch follow the speed, and least squares on derivatives would
-    take that for a property of the rotor.
-    """
-    known, only = {}, {}
-    for rotor, term in _rotors(samples, settings):
-        brake = term.acceleration_per_generator_torque
-        if rotor.generator_torque is not None and brake is not None:
-            known[rotor.speed] = {rotor.generator_torque: brake}
-            only[rotor.speed] = (rotor.generator_torque, term.channels[1].name)
-    return known, only
-
-
-def _aerodynamics(
-    samples: Samples, settings: FitSettings, rows: Mapping[str, int]
-) -> dict[tuple[int, int], float]:
-    """What the rotor's own torque does, by its table: where refinement begins."""
-    values = {}
-    for rotor, term in _rotors(samples, settings):
-        push = term.acceleration_per_rotor_torque
-        if rotor.generator_torque is not None and push is not None:
-            column = samples.linear_names.index(term.channels[1].name)
-            values[_row(rows, rotor.speed, "known"), column] = push
-    return values
+    for rotor, term in zip(settings.terms, parts, strict=True):
+        if not (isinstance(rotor, Rotor) and isinstance(term, RotorTerm)):
+            continue
+        push, brake = term.acceleration_per_rotor_torque, term.acceleration_per_generator_torque
+        if rotor.generator_torque is not None and push is not None and brake is not None:
+            known[rotor.speed] = {rotor.generator_torque: brake, term.channels[1].name: push}
+    return known

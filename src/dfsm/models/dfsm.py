@@ -177,6 +177,15 @@ class DFSM(eqx.Module):
             return 0
         return 2 * len(harmonics_of(azimuth)) if azimuth.rings else 2
 
+    @property
+    def balances(self) -> tuple[int, ...]:
+        """States whose row is known and which latent states reach through a known term alone."""
+        if self.terms is None:
+            return ()
+        first, complete = self.signals.state_columns.start, self.f.complete()
+        rows = (part.driven - first for part in self.terms.parts if part.driven is not None)
+        return tuple(row for row in rows if row in complete)
+
     def join(
         self,
         states: ArrayLike,

@@ -12,7 +12,7 @@ evaluates a model treats them like any other state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,6 +27,8 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
+from dfsm.models.terms import Terms
+from dfsm.models.terms.form import Schedule
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 
 # Before the record begins, the inputs are taken to have been what they were on average over this.
@@ -233,7 +235,13 @@ def rest(time: Array, inputs: Array) -> Array:
 # -- adding them to a model ---------------------------------------------------------------------
 
 
-def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[Array]) -> DFSM:
+def add_latents(
+    model: DFSM,
+    dynamics: Poles,
+    coupling: Array,
+    paths: Sequence[Array],
+    gains: Mapping[int, Array] | None = None,
+) -> DFSM:
     """A model with latent states in addition.
 
     Parameters
@@ -247,6 +255,9 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         ``(state, 2 pair)``.
     paths
         Their values along the training runs, each ``(time, 2 pair)``.
+    gains
+        What one unit of each adds to the first signal of some known terms, by the term's place,
+        ``(2 pair,)``.
     """
     s, count = model.signals, coupling.shape[1]
     at, n = s.state_columns.stop, len(s.states)
@@ -257,7 +268,18 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         b = np.pad(np.asarray(linear.offsets), ((0, 0), (0, extra_rows)))
         if extra_rows:
             L[:, :n, at : at + count] = coupling
-        return replace(linear, coefficients=jnp.asarray(L), offsets=jnp.asarray(b))
+        known = [(row, c + count if c >= at else c) for row, c in linear.known]
+        if extra_rows:
+            # They reach a balance of known torques through its term.
+            known += [(row, c) for row in model.balances for c in range(at, at + count)]
+        schedule = linear.schedule
+        return replace(
+            linear,
+            schedule=schedule + count if schedule is not None and schedule >= at else schedule,
+            coefficients=jnp.asarray(L),
+            offsets=jnp.asarray(b),
+            known=tuple(sorted(known)),
+        )
 
     f = wider(model.f, count)
     names = tuple(Channel(f"latent{k + 1}", "-") for k in range(count))
@@ -271,9 +293,23 @@ def add_latents(model: DFSM, dynamics: Poles, coupling: Array, paths: Sequence[A
         corrected_outputs=model.corrected_outputs,
         signals=replace(s, states=(*s.states, *names), latents=names),
         provenance=model.provenance,
-        terms=None if model.terms is None else model.terms.with_more_inputs(at, count),
+        terms=_terms(model, at, names, gains or {}),
     )
     return with_poles(wide, dynamics)
+
+
+def _terms(
+    model: DFSM, at: int, names: Sequence[Channel], gains: Mapping[int, Array]
+) -> Terms | None:
+    if model.terms is None:
+        return None
+    wide, column = model.terms.with_more_inputs(at, len(names)), model.f.schedule
+    if column is not None and column >= at:
+        column += len(names)
+    schedule, parts = Schedule(column, np.asarray(model.f.grid)), list(wide.parts)
+    for place, weights in gains.items():
+        parts[place] = parts[place].with_latents([c.name for c in names], at, weights, schedule)
+    return replace(wide, parts=tuple(parts))
 
 
 def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:

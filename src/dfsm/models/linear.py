@@ -33,6 +33,22 @@ class LinearModel(eqx.Module):
     schedule: int | None = eqx.field(static=True)
     known: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
+    def complete(self, latent: slice = slice(0, 0)) -> tuple[int, ...]:
+        """Targets all of whose coefficients are known, but for those of latent states."""
+        targets, width = self.coefficients.shape[1:]
+        places = set(range(width)) - set(range(width)[latent])
+        by_target = [{c for t, c in self.known if t == target} for target in range(targets)]
+        return tuple(target for target, known in enumerate(by_target) if known >= places)
+
+    def hidden_among(self, inputs: int, latent: slice = slice(0, 0)) -> tuple[int, ...]:
+        """Which of the first columns no corrective function may take, lest it undo what is known.
+
+        Targets all of whose coefficients are known are not corrected, and do not count.
+        """
+        complete = self.complete(latent)
+        places = {c for target, c in self.known if c < inputs and target not in complete}
+        return tuple(sorted(places))
+
     def known_among(self, inputs: int) -> tuple[int, ...]:
         """Which of the first columns have a coefficient that is known."""
         return tuple(sorted({column for _, column in self.known if column < inputs}))

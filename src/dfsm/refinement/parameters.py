@@ -34,7 +34,8 @@ class Parametrization(eqx.Module):
     model
         The model at zero.
     rows
-        Rows of the linear fit that are neither kinematic nor of latent states.
+        Rows of the linear fit that are neither kinematic nor of latent states nor
+        balances of known torques.
     spread
         Typical size of each of these derivatives, shape ``(row,)``, in its unit.
     scheduled, constant
@@ -57,7 +58,7 @@ class Parametrization(eqx.Module):
     def of(cls, model: DFSM, spread: Array) -> Parametrization:
         """Make one; `spread` holds the typical size of the observed states' derivatives."""
         s = model.signals
-        known = kinematic_rows(s.specs)
+        known = {*kinematic_rows(s.specs), *model.balances}
         rows = tuple(i for i in range(len(s.observed)) if i not in known)
         L = np.asarray(model.f.coefficients)[:, list(rows)]
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
@@ -173,8 +174,7 @@ class Parametrization(eqx.Module):
         parts.append(jnp.zeros((steps, observed, self.latent_columns.size)))
         if self._term_shapes:
             by_term = self._term_slopes(deviations, model, inputs)
-            rows = weights[..., list(self.rows)]
-            parts += [jnp.einsum("tiar,tirp->tap", rows, by_term)]
+            parts += [jnp.einsum("tiar,tirp->tap", weights, by_term)]
         if self._corrective_shapes:
             corrected = weights[..., list(self.model.corrected)]
             by_part = self._corrective_slopes(deviations, inputs)
@@ -182,9 +182,10 @@ class Parametrization(eqx.Module):
         return jnp.concatenate(parts, axis=2)
 
     def _term_slopes(self, deviations: jax.Array, model: DFSM, inputs: jax.Array) -> jax.Array:
-        """∂(L_φ φ)/∂θ, shape ``(step, i, row, parameter of terms)``."""
+        """∂(L_φ φ)/∂θ, shape ``(step, i, observed state, parameter of terms)``."""
         terms, _ = self._divided(self._parts(deviations)[4:])
-        first, rows = len(model.signals.inputs), list(self.rows)
+        # Those of rows that are known, too: what a term takes may be learnt.
+        first, observed = len(model.signals.inputs), len(model.signals.observed)
 
         def at_one(inputs: jax.Array) -> jax.Array:
             def values(parts: list[jax.Array]) -> jax.Array:
@@ -194,7 +195,7 @@ class Parametrization(eqx.Module):
             by_part = jax.jacfwd(values)(terms)
             J = jnp.concatenate([p.reshape(p.shape[0], -1) for p in by_part], axis=1)
             L, _ = model.f.at(inputs[model.f.schedule or 0])
-            return L[np.array(rows), first:] @ J
+            return L[:observed, first:] @ J
 
         return jax.vmap(jax.vmap(at_one))(inputs)
 

@@ -92,11 +92,19 @@ class Record:
         pairs = self.follow(poles(model))[self.before :]
         return np.asarray(as_states(jnp.asarray(pairs)))
 
-    def left_over(self, model: DFSM) -> Array:
-        """Recorded minus modelled derivatives of the observed states, ``(step + 1, state)``."""
+    def inputs_at(self, model: DFSM) -> Array:
+        """I along the record, ``(step + 1, input)``."""
+        states, exogenous = self._along(model)
+        return np.asarray(model.join(jnp.asarray(states), *exogenous))
+
+    def _along(self, model: DFSM) -> tuple[Array, Any]:
         states = np.concatenate([self.states, self.latent_states(model)], axis=1)
         inputs = jnp.asarray(self.inputs[2 * self.before :: 2])
-        exogenous = model.signals.order.split_exogenous(inputs)
+        return states, model.signals.order.split_exogenous(inputs)
+
+    def left_over(self, model: DFSM) -> Array:
+        """Recorded minus modelled derivatives of the observed states, ``(step + 1, state)``."""
+        states, exogenous = self._along(model)
         modelled = np.asarray(model.derivative(states, *exogenous))
         return self.slopes - modelled[:, : self.slopes.shape[1]]
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.data.derivatives import kinematic_rows
 from dfsm.models.corrective import Perceptron
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, add_latents, as_states
@@ -56,7 +57,8 @@ def start_latents(
     pairs, driving = count // 2, s.order.driving_columns
     longest = max((len(r.states) - 1) * r.step for r in records)
     decay = np.geomspace(_SLOWEST / longest, 1 / (_FASTEST * records[0].step), pairs)
-    rows = list(Parametrization.of(model, spread).rows)
+    kinematic = kinematic_rows(s.specs)
+    rows = [i for i in range(len(s.observed)) if i not in kinematic]
     left = np.concatenate([r.left_over(model)[:, rows] / spread[rows] for r in records])
 
     std = np.asarray(region.scale)[driving]
@@ -80,8 +82,9 @@ def start_latents(
     # Re(c ζ) in terms of the real states Re ζ and Im ζ.
     both = np.stack([c.real, -c.imag], axis=2).reshape(len(rows), count)
     coupling[rows] = both * spread[rows, None]
+    gains = _through_terms(model, records, coupling)
     along = [np.asarray(as_states(jnp.asarray(z))) for z in pairs_along]
-    return add_latents(model, dynamics, coupling, along)
+    return add_latents(model, dynamics, coupling, along, gains)
 
 
 def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
@@ -104,7 +107,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         Predicts what it did before. Inputs whose effect is known from physics are
         hidden from the network.
     """
-    rows = Parametrization.of(model, spread).rows
+    known = model.f.complete(model.signals.latent_columns)
+    rows = tuple(r for r in Parametrization.of(model, spread).rows if r not in known)
     rng, inputs, region = np.random.default_rng(seed), len(model.signals.inputs), model.region
     directions = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
     network = Perceptron(
@@ -113,7 +117,46 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
-    return replace(model, e=network.ignoring(model.f.known_among(inputs)), corrected=rows)
+    hidden = model.f.hidden_among(inputs, model.signals.latent_columns)
+    return replace(model, e=network.ignoring(hidden), corrected=rows)
+
+
+def _through_terms(model: DFSM, records: Sequence[Record], coupling: Array) -> dict[int, Array]:
+    """Effects of latent states on rows that are known, as effects on the first signal of a term.
+
+    Parameters
+    ----------
+    model
+        Without latent states.
+    records
+        Training runs.
+    coupling
+        What one unit of each latent state adds to the derivatives, shape ``(state, latent)``; rows
+        that are known become zero, and what reaches others through a term is taken from them.
+
+    Returns
+    -------
+    dict
+        By place of the term, shape ``(latent,)``.
+    """
+    if model.terms is None:
+        return {}
+    first, inputs = len(model.signals.inputs), model.signals.state_columns.start
+    at = np.concatenate([r.inputs_at(model) for r in records])
+    slopes = model.terms.slopes(at).mean(axis=0)
+    L, gains, value = np.asarray(model.f.coefficients).mean(axis=0), {}, first
+    for place, term in enumerate(model.terms.parts):
+        columns = slice(value, value + len(term.channels))
+        value = columns.stop
+        if term.driven is None or (row := term.driven - inputs) not in model.balances:
+            continue
+        # Per unit of the signal, in every row.
+        effect = L[:, columns] @ slopes[columns.start - first : columns.stop - first]
+        effect = effect[:, term.columns[0]]
+        gains[place] = coupling[row] / effect[row]
+        coupling -= np.outer(effect, gains[place])
+        coupling[row] = 0.0
+    return gains
 
 
 def _poles(decay: Array, drive: Array, middle: Array) -> Poles:

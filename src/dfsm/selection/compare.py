@@ -26,9 +26,11 @@ from dfsm.core.fallback import write_or_keep
 from dfsm.core.files import check_file, json_value, write_json
 from dfsm.core.lock import locked
 from dfsm.core.progress import track
+from dfsm.core.settings import require
 from dfsm.core.workers import default_jobs, work_through
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import state_names
+from dfsm.data.hold_out import HoldOut, checked, divisions
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
@@ -157,7 +159,7 @@ def compare(
     output: str | Path,
     *,
     validation: Iterable[Trajectory] | None = None,
-    hold_out: float = HOLD_OUT,
+    hold_out: float | HoldOut = HOLD_OUT,
     jobs: int | None = None,
 ) -> Ranking:
     """Fit candidate structures and rank them on rollouts over validation runs.
@@ -179,7 +181,8 @@ def compare(
         Runs to rank by; those that are among `runs` are not trained with. None holds out some
         of `runs`.
     hold_out
-        Share of the runs that is held out where there is no `validation`, at least one.
+        Share of the runs that is held out where there is no `validation`, at least one; or a
+        `HoldOut` of one split, which leaves out whole operating points.
     jobs
         Number of processes; None takes half the processors. With one, all is done in this one.
 
@@ -299,14 +302,16 @@ def _try_task(course: Course, task: _Task) -> tuple[Outcome, DFSM | None]:
 def _shares(
     runs: Iterable[Trajectory],
     validation: Iterable[Trajectory] | None,
-    hold_out: float,
+    hold_out: float | HoldOut,
     first: Candidate,
 ) -> tuple[Dataset, Dataset]:
     if validation is None:
         data, settings = Dataset(runs), first.settings
         # One that has to be computed first is left out; the others tell runs apart, too.
         together = [n for n in settings.disturbances if n in data.names]
-        return data.split(hold_out, settings.seed, together)
+        how = checked(hold_out, "hold_out")
+        require(how.splits == 1, "hold_out.splits", how.splits, "1: candidates are ranked on one")
+        return divisions(data, how, settings.seed, together, settings.start, settings.stop)[0]
     judged = Dataset(validation)
     digests = {run.digest for run in judged}
     training = [run for run in runs if run.digest not in digests]

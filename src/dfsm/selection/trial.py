@@ -24,7 +24,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import with_computed
 from dfsm.numerics.time_mesh import weights_over_time
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.refine import RefineSettings
+from dfsm.refinement.settings import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
 from dfsm.validation.results import ChannelError, spread, training_spreads
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -14,6 +14,21 @@ import numpy as np
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
+
+
+class Schedule(NamedTuple):
+    """What coefficients vary along.
+
+    Attributes
+    ----------
+    column
+        In I; None where nothing varies.
+    grid
+        Its points, shape ``(point,)``.
+    """
+
+    column: int | None
+    grid: Array
 
 
 class Term(eqx.Module):
@@ -48,6 +63,33 @@ class Term(eqx.Module):
     def with_more_inputs(self, at: int, count: int) -> Self:
         """The same term where I has `count` more inputs from column `at` on."""
         return replace(self, columns=tuple(c + count if c >= at else c for c in self.columns))
+
+    @property
+    def driven(self) -> int | None:
+        """Column in I of a state whose row of the linear fit is known because of this term."""
+        return None
+
+    def with_latents(
+        self,
+        names: Sequence[str],  # noqa: ARG002
+        first: int,  # noqa: ARG002
+        gains: Array,  # noqa: ARG002
+        schedule: Schedule,  # noqa: ARG002
+    ) -> Self:
+        """The same term where latent states reach the state that it drives through it alone.
+
+        Parameters
+        ----------
+        names
+            Of the latent states.
+        first
+            Column in I of the first of them.
+        gains
+            Their effect at first, in the unit of the term's first signal, shape ``(latent,)``.
+        schedule
+            Along which that may vary.
+        """
+        return self
 
     # -- data -----------------------------------------------------------------------------------
 

@@ -18,10 +18,11 @@ from dfsm.core.units import factor
 from dfsm.data.readers.rotor_table import RotorTable, read_rotor_table
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
-from dfsm.models.terms.form import Term
+from dfsm.models.terms.form import Schedule, Term
 from dfsm.models.terms.inputs import input_columns
 from dfsm.models.terms.rotor_check import check_signals
 from dfsm.models.terms.rotor_surface import TOLERANCE, Grid, make_surface, surface_values
+from dfsm.numerics.hats import hats
 
 # kg/m³ of what rotors turn in.
 _AIR, _WATER = (0.8, 1.6), (950.0, 1100.0)
@@ -65,6 +66,11 @@ class Rotor:
         brakes it, in kN-m: with both the fit knows what the torques do to the speed.
     efficiency
         Of the gearbox: the part of the rotor's power that reaches the generator.
+    memory
+        How latent states reach the speed of a rotor of known inertia. ``"speed"``: they add to its
+        rate, which predicts recorded runs best. ``"wind"``: they change the wind that the rotor
+        feels, so that neither thrust nor torque exceed what the table has, whatever an optimizer
+        does.
     name
         What the values are called: ``<name>.thrust`` in kN and ``<name>.torque`` in kN-m.
     """
@@ -83,6 +89,7 @@ class Rotor:
     inertia: float | None = None
     generator_torque: str | None = None
     efficiency: float = 1.0
+    memory: Literal["speed", "wind"] = "speed"
     name: str = "rotor"
     kind: Literal["rotor"] = "rotor"
 
@@ -180,6 +187,7 @@ class Rotor:
             gearbox_ratio=self.gearbox_ratio,
             inertia=self.inertia,
             efficiency=self.efficiency,
+            memory=self.memory,
             ratios=(float(table.tip_speed_ratio[0]), float(table.tip_speed_ratio[-1])),
             angles=(float(table.pitch[0]), float(table.pitch[-1])),
             optimum=table.optimum[0],
@@ -193,6 +201,8 @@ class Rotor:
             weights=jnp.asarray(weights),
             gains=jnp.zeros(len(self.corrections)),
             scale=jnp.asarray(self._scale(spreads or {})),
+            late=jnp.zeros((1, 1)),
+            grid_of_late=jnp.zeros(1),
             grid=grid,
             about=about,
         )
@@ -230,7 +240,7 @@ class RotorConstants:
     ----------
     inputs
         Names of the signals.
-    radius, density, gearbox_ratio, inertia, efficiency
+    radius, density, gearbox_ratio, inertia, efficiency, memory
         See `Rotor`.
     speed_factor
         The rotor's speed in rad/s per unit of the signal.
@@ -260,6 +270,7 @@ class RotorConstants:
     gearbox_ratio: float
     inertia: float | None
     efficiency: float
+    memory: str
     ratios: tuple[float, float]
     angles: tuple[float, float]
     optimum: float
@@ -283,6 +294,9 @@ class RotorTerm(Term):
         a, shape ``(correction,)``.
     scale
         How large a change of each of them is large, shape ``(correction,)``.
+    late, grid_of_late
+        What latent states add to the wind: by schedule point what a unit of each adds, and last
+        what is added anyway, in m/s, shape ``(point, latent + 1)``; and the points.
     grid
         Where the splines lie.
     about
@@ -293,6 +307,8 @@ class RotorTerm(Term):
     weights: jax.Array
     gains: jax.Array
     scale: jax.Array
+    late: jax.Array
+    grid_of_late: jax.Array
     grid: Grid = eqx.field(static=True)
     about: RotorConstants = eqx.field(static=True)
 
@@ -322,8 +338,13 @@ class RotorTerm(Term):
         if about.surges:
             wind = wind - signals[..., at]
             at += 1
-        if at < len(self.columns):
-            wind = wind + jnp.sum(self.gains * signals[..., at:], axis=-1)
+        if corrections := self.gains.shape[0]:
+            wind = wind + signals[..., at : at + corrections] @ self.gains
+            at += corrections
+        if latents := self.late.shape[1] - 1:
+            shares = hats(self.grid_of_late, signals[..., at + latents])
+            added = signals[..., at : at + latents] @ self.late[:, :-1].T + self.late[:, -1]
+            wind = wind + jnp.sum(shares * added, axis=-1)
         speed = about.radius * about.speed_factor * signals[..., 1]
         return wind, speed, about.pitch_factor * signals[..., 2]
 
@@ -337,6 +358,43 @@ class RotorTerm(Term):
         (low, high), (first, last) = self.about.ratios, self.about.angles
         within = (wind > 0) & (speed >= low * wind) & (speed <= high * wind)
         return ~(within & (pitch >= first) & (pitch <= last))
+
+    # -- latent states --------------------------------------------------------------------------
+
+    @property
+    def driven(self) -> int | None:
+        """Column in I of the speed, where latent states reach it through the wind alone."""
+        through_wind = self.about.inertia is not None and self.about.memory == "wind"
+        return self.columns[1] if through_wind else None
+
+    def with_latents(
+        self, names: Sequence[str], first: int, gains: Array, schedule: Schedule
+    ) -> RotorTerm:
+        """The term of a model whose latent states change the wind that the rotor feels.
+
+        What the air remembers, the wake that settles after the blades have pitched, reaches the
+        rotor as another wind; so neither thrust nor torque exceed what the table has.
+
+        Parameters
+        ----------
+        names
+            Of the latent states.
+        first
+            Column in I of the first of them.
+        gains
+            What one unit of each adds to the wind at first, in m/s, shape ``(latent,)``.
+        schedule
+            Along which that may vary.
+        """
+        columns = (*self.columns, *range(first, first + len(names)), schedule.column or 0)
+        late = np.tile(np.append(gains, 0.0), (len(schedule.grid), 1))
+        return replace(
+            self,
+            columns=columns,
+            late=jnp.asarray(late),
+            grid_of_late=jnp.asarray(schedule.grid),
+            about=replace(self.about, inputs=(*self.about.inputs, *names)),
+        )
 
     # -- what the fit knows of it -----------------------------------------------------------------
 
@@ -390,13 +448,17 @@ class RotorTerm(Term):
     @property
     def parameters(self) -> tuple[jax.Array, ...]:
         """The weights of the corrections, if there are any."""
-        return (self.gains,) if self.gains.shape[0] else ()
+        late = (self.late,) if self.late.shape[1] > 1 else ()
+        return (*((self.gains,) if self.gains.shape[0] else ()), *late)
 
     def moved(self, deviations: Sequence[jax.Array]) -> RotorTerm:
         """The term with other weights of the corrections."""
-        if not self.gains.shape[0]:
-            return self
-        return replace(self, gains=self.gains + self.scale * deviations[0])
+        gains, late, rest = self.gains, self.late, list(deviations)
+        if gains.shape[0]:
+            gains = gains + self.scale * rest.pop(0)
+        if late.shape[1] > 1:
+            late = late + rest.pop(0)
+        return replace(self, gains=gains, late=late)
 
     # -- model folders --------------------------------------------------------------------------
 
@@ -406,7 +468,8 @@ class RotorTerm(Term):
 
     def arrays(self) -> dict[str, jax.Array]:
         """Splines, weights of the corrections and their scale."""
-        return {"weights": self.weights, "gains": self.gains, "scale": self.scale}
+        arrays = {"weights": self.weights, "gains": self.gains, "scale": self.scale}
+        return arrays | {"late": self.late, "grid_of_late": self.grid_of_late}
 
     @classmethod
     def restored(
@@ -417,7 +480,7 @@ class RotorTerm(Term):
         structure: Mapping[str, Any],
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
-        told = structure["about"]
+        told = {"memory": "speed", **structure["about"]}
         # JSON turns tuples into lists, which are no keys of compiled functions.
         about: dict[str, Any] = {
             f.name: tuple(told[f.name]) if isinstance(told[f.name], list) else told[f.name]
@@ -429,6 +492,9 @@ class RotorTerm(Term):
             weights=arrays["weights"],
             gains=arrays["gains"],
             scale=arrays["scale"],
+            # Models of 0.1 and before have none.
+            late=arrays.get("late", jnp.zeros((1, 1))),
+            grid_of_late=arrays.get("grid_of_late", jnp.zeros(1)),
             grid=Grid(**structure["grid"]),
             about=RotorConstants(**about),
         )
