@@ -18,7 +18,8 @@ from dfsm.models.terms.form import Term
 from dfsm.models.terms.function import Function, FunctionTerm, ScalarFunction
 from dfsm.models.terms.product import Product, ProductTerm
 from dfsm.models.terms.quadratic_drag import QuadraticDrag, QuadraticDragTerm
-from dfsm.models.terms.rotor import Rotor, RotorTerm
+from dfsm.models.terms.rotor import Rotor
+from dfsm.models.terms.rotor_term import RotorTerm
 from dfsm.models.terms.terms import Terms, TermSettings, terms_of
 
 __all__ = [

@@ -13,7 +13,7 @@ from dfsm.core.units import agree, factor
 from dfsm.errors import DfsmError
 
 if TYPE_CHECKING:
-    from dfsm.models.terms.rotor import RotorTerm
+    from dfsm.models.terms.rotor_term import RotorTerm
 
 # Shares of the samples beyond the table that are refused, and that are told.
 _REFUSED, _TOLD = 0.9, 0.1
