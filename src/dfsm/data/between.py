@@ -103,8 +103,12 @@ def combined(first: Chosen, then: Chosen, names: Sequence[str]) -> Chosen:
     """What two choices say together of some inputs: the first goes before, name by name."""
     if isinstance(first, str):
         return first
-    rest = dict.fromkeys(names, then) if isinstance(then, str) else then
-    return {**(rest or {}), **(first or {})} or None
+    rest: dict[str, Between] = {}
+    if isinstance(then, str):
+        rest.update((name, then) for name in names)
+    else:
+        rest.update(then or {})
+    return {**rest, **(first or {})} or None
 
 
 def parse_chosen(text: str | None) -> Chosen:

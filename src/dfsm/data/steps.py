@@ -99,10 +99,16 @@ class Steps:
     def window(self, inside: NDArray[np.bool_]) -> Steps:
         """Some samples, one after the other, and the intervals between them."""
         pairs = inside[:-1] & inside[1:]
-        sides = (self.begin, self.end, self.begin_slope, self.end_slope)
-        parts = (side[pairs] for side in sides)
-        some = self.time[inside], self.states[inside], self.own[inside]
-        return Steps(*some, *parts, self.specs, self.driving)
+        return replace(
+            self,
+            time=self.time[inside],
+            states=self.states[inside],
+            own=self.own[inside],
+            begin=self.begin[pairs],
+            end=self.end[pairs],
+            begin_slope=self.begin_slope[pairs],
+            end_slope=self.end_slope[pairs],
+        )
 
     @property
     def steps(self) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dfsm.core.shapes import Series
 
@@ -104,7 +103,9 @@ def std_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
     return np.sqrt(mean_over((values - mean_over(values, weights)) ** 2, weights))
 
 
-def quantiles_over(values: Series, at: ArrayLike, weights: Series | None) -> np.ndarray:
+def quantiles_over(
+    values: Series, at: float | Sequence[float], weights: Series | None
+) -> np.ndarray:
     """Quantiles of samples ``(sample,)`` at shares of their number, or of their weight."""
     if weights is None:
         return np.quantile(values, at)

@@ -33,6 +33,11 @@ class EndingAtBends(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     begins: jax.Array
     ends: jax.Array
 
+    def __init__(
+        self, controller: diffrax.PIDController, begins: jax.Array, ends: jax.Array
+    ) -> None:
+        self.controller, self.begins, self.ends = controller, begins, ends
+
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Relative tolerance, which implicit solvers ask for."""
@@ -44,7 +49,7 @@ class EndingAtBends(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
         return self.controller.atol
 
     @property
-    def norm(self) -> Callable[[Any], Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def norm(self) -> Callable[[Any], Any]:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
         """Norm of errors."""
         return self.controller.norm
 

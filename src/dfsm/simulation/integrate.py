@@ -385,7 +385,7 @@ def _adapt(
 
     spread = model.region.std[model.signals.state_columns]
     spread = jnp.where(spread > 0, spread, 1.0)
-    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, inputs(t)) / spread)
+    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, inputs(jnp.asarray(t))) / spread)
     solution = diffrax.diffeqsolve(
         term,
         diffrax.Tsit5() if method == "tsit5" else diffrax.Kvaerno5(),
