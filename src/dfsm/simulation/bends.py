@@ -34,6 +34,11 @@ class EndingAtBends(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     begins: jax.Array
     ends: jax.Array
 
+    def __init__(
+        self, controller: diffrax.PIDController, begins: jax.Array, ends: jax.Array
+    ) -> None:
+        self.controller, self.begins, self.ends = controller, begins, ends
+
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Relative tolerance, which implicit solvers ask for."""
