@@ -131,5 +131,5 @@ def test_what_cannot_be_loaded_is_one_sentence(tmp_path):
         BladedLibrary(text, deck, interval=0.1)
     with pytest.raises(DfsmError, match="there is no role 'winds'; did you mean 'wind'"):
         BladedLibrary(text, interval=0.1, channels={"winds": "Wind1VelX"})
-    with pytest.raises(DfsmError, match="wind 'Wind' is in 'kn', expected one of m/s"):
-        BladedLibrary(text, interval=0.1, channels={"wind": ("Wind", "kn")})
+    with pytest.raises(DfsmError, match="wind 'Wind' is in 'kN', which is no unit like m/s"):
+        BladedLibrary(text, interval=0.1, channels={"wind": ("Wind", "kN")})

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from dfsm import DfsmError, DfsmWarning, Feature, FitSettings, StateSpec, Trajectory, simulate
+from dfsm import (
+    DerivativeSettings,
+    DfsmError,
+    DfsmWarning,
+    Feature,
+    FitSettings,
+    StateSpec,
+    Trajectory,
+    simulate,
+)
 from dfsm.control.names import plant_of
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel
@@ -200,20 +209,20 @@ def test_stray_samples_and_runs_in_another_unit():
     rng = np.random.default_rng(6)
     runs = [run(time, x=5 + rng.standard_normal(100)) for _ in range(3)]
     window = (None, None)
-    assert screened(runs, ["x"], "refuse", window) == runs
+    assert screened(runs, ["x"], "refuse", window, DerivativeSettings()) == runs
     for value in (1e6, 1e160):
         x = runs[0]["x"].copy()
         x[40] = value
         bad = [run(time, x=x), *runs[1:]]
         with pytest.raises(DfsmError, match=r"run: 'x' is 1e\+\d+ at 40 s, far beyond"):
-            screened(bad, ["x"], "refuse", window)
-        mended = screened(bad, ["x"], "drop", window)[0]
+            screened(bad, ["x"], "refuse", window, DerivativeSettings())
+        mended = screened(bad, ["x"], "drop", window, DerivativeSettings())[0]
         assert mended["x"][40] == pytest.approx((x[39] + x[41]) / 2)
-        assert screened(bad, ["x"], "keep", window) == bad
+        assert screened(bad, ["x"], "keep", window, DerivativeSettings()) == bad
     mixed = [run(time, x=runs[0]["x"] * 1000), *runs[1:]]
     with pytest.raises(DfsmError, match=r"'x' \(no unit\) is \d+ times .* \(a thousand\)"):
-        screened(mixed, ["x"], "refuse", window)
-    assert screened(mixed, ["x"], "drop", window) == mixed[1:]
+        screened(mixed, ["x"], "refuse", window, DerivativeSettings())
+    assert screened(mixed, ["x"], "drop", window, DerivativeSettings()) == mixed[1:]
     pulse = np.zeros(100)
     pulse[30] = 1.0
-    screened([run(time, x=pulse)], ["x"], "refuse", window)
+    screened([run(time, x=pulse)], ["x"], "refuse", window, DerivativeSettings())

@@ -10,7 +10,7 @@ import pytest
 
 from dfsm.data.derivatives import StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
 from dfsm.fitting.linear import LPV, LTI
@@ -107,7 +107,9 @@ def test_a_model_without_a_schedule():
 
 def test_a_channel_that_is_always_zero(tmp_path):
     silent = [replace(r, values=r.values * [1, 1, 0]) for r in map(run, range(12))]
-    found = calibrate(fit(silent[:8], SETTINGS).model, silent[8:])
+    with pytest.warns(DfsmWarning, match="output 'y' is 0 throughout"):
+        model = fit(silent[:8], SETTINGS).model
+    found = calibrate(model, silent[8:])
     assert found.half_width[:, 1].max() < 1e-12
     found.save(tmp_path / "i.json")
     assert (load_intervals(tmp_path / "i.json").half_width == found.half_width).all()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import files_of
+from dfsm.core.bundle import checksum
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
 from dfsm.validation.intervals import load_intervals
@@ -105,6 +106,10 @@ def test_bad_input_is_told_and_costs_nothing(here, dfsm, fitted, fresh, interval
         assert said in dfsm(*command).sentence
     content = json.loads(intervals.read_text())
     content["channels"][0]["name"] = "p"
+    Path("x.json").write_text(json.dumps(content))
+    said = dfsm("validate", "m", runs[0], "--intervals", "x.json").sentence
+    assert "x.json is damaged, it is not as it was written" in said
+    content["checksum"] = checksum(content)
     Path("x.json").write_text(json.dumps(content))
     for command in (("simulate", "m", runs[0], "-o", "o.csv"), ("validate", "m", runs[0])):
         said = dfsm(*command, "--intervals", "x.json").sentence

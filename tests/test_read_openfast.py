@@ -420,9 +420,9 @@ def test_the_correction_converts_units_and_carries_the_step(tmp_path):
         undisturbed_rotor_wind(
             read(write_outb(path, time, values, names, ("m/s", "m", "m"))), 100.0
         )
-    with pytest.raises(DfsmError, match="'RtVAvgxh' is in 'ft/s', expected m/s"):
+    with pytest.raises(DfsmError, match="'RtVAvgxh' is in 'kN', expected m/s"):
         undisturbed_rotor_wind(
-            read(write_outb(path, time, values, names, ("ft/s", "deg/s", "m"))), 100.0
+            read(write_outb(path, time, values, names, ("kN", "deg/s", "m"))), 100.0
         )
     with pytest.raises(DfsmError, match="hub_height is -1"):
         undisturbed_rotor_wind(run, -1)

@@ -185,13 +185,11 @@ def test_runs_with_the_same_disturbances_show_what_controls_do():
 def test_runs_are_held_out_several_times_and_then_all_train(runs, biased):
     settings = replace(CHOICES, windows=(5.0,), iterations=3, hold_out=HoldOut(share=0.3, splits=2))
     result = refine(biased, runs, settings)
-    assert result.improved
-    assert len(result.splits) == 2
+    assert result.improved and len(result.splits) == 2  # noqa: PT018
     assert np.mean(result.splits, axis=0) == pytest.approx([result.before, result.after])
     splits = result.model.provenance.record["refinement"]["splits"]
     assert splits[0]["validation"] != splits[1]["validation"]
     assert "held out 2 times" in result.message
-    # Steps on all runs, from the start; as many as were best.
     last = [entry["training"] for entry in result.history if "split" not in entry]
     assert 1 <= len(last) <= 3
     assert float(result.model.f.coefficients[0, 1, 2]) == pytest.approx(-0.6, abs=0.15)
@@ -285,11 +283,12 @@ def test_curvature_of_slopes_that_grow_along_a_window():
     v = 0.5 + np.zeros((2 * steps + 1, 1))
     errors = np.random.default_rng(0).normal(size=(steps, 1))
     at, start = jnp.zeros(parameters.size), jnp.zeros((0, 2, 0))
+    drive = tuple(map(jnp.asarray, (v[:-2:2], v[1::2], v[2::2])))
     sums, totals = {}, {}
     compiled = eqx.filter_jit(sensitivities)
     for every in (1, 4):
         S, totals[every] = compiled(
-            parameters, at, step, jnp.zeros(1), start, jnp.asarray(v), jnp.asarray(errors), every
+            parameters, at, step, jnp.zeros(1), start, drive, jnp.asarray(errors), every
         )
         J = np.asarray(S)[:, 0] * np.sqrt(spread_steps(steps, every)[1])[:, None]
         sums[every] = J.T @ J

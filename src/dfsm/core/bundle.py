@@ -64,7 +64,7 @@ class Bundle:
             By file name what writes a page about them, into the same folder in the same step.
         """
         # Made in memory: the library that writes them does not tell a full disk from a bug.
-        arrays = save({name: np.ascontiguousarray(a) for name, a in tensors.items()})
+        arrays = save({name: np.asarray(a, order="C") for name, a in tensors.items()})
         with write_folder(path, is_ours=is_ours) as folder:
             (folder / self.tensors).write_bytes(arrays)
             manifest = {

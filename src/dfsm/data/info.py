@@ -126,9 +126,9 @@ def describe(trajectory: Trajectory) -> RunInfo:
 
 
 def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
-    if len(values) > _BLOCK and weights_over_time([time]) is None:
-        return _long_channel_info(channel, values, time)
     finite = np.isfinite(values)
+    if len(values) > _BLOCK and finite.all() and weights_over_time([time]) is None:
+        return _long_channel_info(channel, values)
     good, time = values[finite], time[finite]
     weights = weights_over_time([time]) if len(time) > 1 else None
     if not len(good):
@@ -149,30 +149,19 @@ def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
 _BLOCK = 1_000_000
 
 
-def _long_channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
+def _long_channel_info(channel: Channel, values: Array) -> ChannelInfo:
     """The same part by part; mean and standard deviation differ in their last digits."""
-    low, high, total, count = math.inf, -math.inf, 0.0, 0
-    for good in _finite_parts(values):
-        low, high = min(low, float(good.min())), max(high, float(good.max()))
-        total, count = total + float(good.sum()), count + len(good)
-    if not count:
-        return _channel_info(channel, values[:1], time[:1])
-    mean = total / count
-    squares = sum(float(np.sum((good - mean) ** 2)) for good in _finite_parts(values))
-    std = math.sqrt(squares / count)
+    low = min(float(part.min()) for part in _parts(values))
+    high = max(float(part.max()) for part in _parts(values))
+    mean = sum(float(part.sum()) for part in _parts(values)) / len(values)
+    squares = sum(float(np.sum((part - mean) ** 2)) for part in _parts(values))
+    std = math.sqrt(squares / len(values))
     return ChannelInfo(channel.name, channel.unit, low, high, mean, std, channel.step)
 
 
 def _parts(values: Array) -> Iterator[Array]:
     for first in range(0, len(values), _BLOCK):
         yield np.ascontiguousarray(values[first : first + _BLOCK])
-
-
-def _finite_parts(values: Array) -> Iterator[Array]:
-    for part in _parts(values):
-        good = part[np.isfinite(part)]
-        if len(good):
-            yield good
 
 
 # Steps this many times the usual one are a hole in the record, not an adaptive mesh.

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from dfsm.core.types import Array, IntArray
+from dfsm.data.derivatives import DerivativeSettings, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 
@@ -30,8 +31,9 @@ _FACTORS = {
     180 / np.pi: "deg per rad",
     30 / np.pi: "rpm per rad/s",
 }
-# How far off a factor may be, and how far apart the other runs.
-_NEAR, _ALIKE = 0.2, 2.0
+# How far off a factor may be (a share, in logarithms) where means tell it and where only spreads
+# do, which differ with the excitation, too; and how far apart the other runs.
+_NEAR, _NEARER, _ALIKE = 0.35, 0.1, 2.0
 _ADVICE = "correct it, or set data.outliers to drop (or to keep, if it is right)"
 
 
@@ -40,6 +42,7 @@ def screened(
     names: Iterable[str],
     what: Suspects,
     window: tuple[float | None, float | None],
+    settings: DerivativeSettings,
 ) -> list[Trajectory]:
     """Refuse runs with samples that cannot be, or do without these.
 
@@ -54,6 +57,9 @@ def screened(
         another unit; ``"keep"`` looks at nothing.
     window
         Start and stop in s of what is compared between runs.
+    settings
+        How much before the start derivatives remember, see `lead_in`; what lies earlier may be as
+        it is.
 
     Raises
     ------
@@ -63,7 +69,12 @@ def screened(
     if what == "keep":
         return list(runs)
     names = list(dict.fromkeys(names))
-    kept = [_without_strays(run, [n for n in names if n in run], what) for run in runs]
+    kept = [
+        _without_strays(
+            run, [n for n in names if n in run], what, lead_in(run, window[0], settings)
+        )
+        for run in runs
+    ]
     for name in names:
         if not all(name in run for run in kept):
             continue
@@ -82,11 +93,14 @@ def screened(
     return kept
 
 
-def _without_strays(run: Trajectory, names: Sequence[str], what: Suspects) -> Trajectory:
+def _without_strays(
+    run: Trajectory, names: Sequence[str], what: Suspects, used: Trajectory
+) -> Trajectory:
     values: Array | None = None
+    first_used = len(run) - len(used)
     for name in names:
         samples = run[name]
-        strays = _strays(samples)
+        strays = first_used + _strays(used[name])
         if not len(strays):
             continue
         if what == "refuse" or len(strays) > _FEW:
@@ -146,8 +160,8 @@ def _other_unit(runs: Sequence[Trajectory], name: str) -> tuple[int, float, str]
         if (others[:, told].min(0) * _ALIKE < usual[told]).any():
             continue
         ratio = np.log(table[place, told] / usual[told])
-        # No run is exactly like another: each figure may differ by as much as the others do.
-        scatter = np.abs(np.log(others[:, told] / usual[told])).max() + _NEAR
+        # No run is exactly like another.
+        scatter = _NEAR if told[2] else _NEARER
         for factor, word in _FACTORS.items():
             for sign, text in ((1, word), (-1, f"1 / {word}")):
                 if np.abs(ratio - sign * np.log(factor)).max() <= scatter:

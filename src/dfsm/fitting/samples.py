@@ -149,7 +149,8 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = [fill_slower(r, settings.slower) for r in runs]
-    runs = screened(list(runs), names, settings.outliers, (settings.start, settings.stop))
+    window = settings.start, settings.stop
+    runs = screened(list(runs), names, settings.outliers, window, settings.derivatives)
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
         names.update(dict.fromkeys(settings.azimuth.field))

@@ -116,7 +116,8 @@ def told_growths(model: DFSM) -> list[Growth]:
     record = model.provenance.record
     if "growth" in record:
         return [Growth(**entry) for entry in record["growth"]]
-    seconds = max((d.get("seconds", 0.0) for d in record.get("data", [])), default=0.0)
+    lengths = [d.get("seconds") for d in record.get("data", [])]
+    seconds = max((s for s in lengths if isinstance(s, int | float)), default=0.0)
     return growths(model, seconds)
 
 

@@ -69,7 +69,7 @@ class QuadraticDrag:
         """
         taken, at = input_columns(self.kind, self.inputs, channels, columns)
         units = [c.unit for c in taken]
-        if not agree(*units):
+        if len(units) == 2 and not agree(*units):
             raise DfsmError(
                 f"{self.kind}: '{self.velocity}' is in '{units[0]}' and '{self.against}' in "
                 f"'{units[1]}', expected one unit: convert one of them"
