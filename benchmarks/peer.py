@@ -40,7 +40,7 @@ def run() -> dict[str, Any]:
     winds = turbine.WINDS["all winds"]
     both = [*turbine.runs(winds, range(1, 9)), *turbine.perturbed(testing=False)]
     # The split that dfsm's refinement makes.
-    training, held = dfsm.Dataset(both).split(dfsm.RefineSettings().hold_out)
+    training, held = dfsm.Dataset(both).split(dfsm.HoldOut().share)
     groups = {
         "closed loop": turbine.runs(winds, range(9, 11)),
         "perturbed": turbine.perturbed(testing=True),

@@ -150,8 +150,8 @@ def refine(
             ended.append(why)
     refined = parameters.at(jnp.asarray(at))
     if refined.signals.latents:
-        runs = [record for group in first.train for record in group]
-        refined = with_latent_range(refined, [r.latent_states(refined) for r in runs])
+        paths = [record.latent_states(refined) for group in first.train for record in group]
+        refined = with_latent_range(refined, paths)
     return _result(model, refined, trials, (history, ended))
 
 

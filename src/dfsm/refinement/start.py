@@ -117,8 +117,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
         weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
         biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
     )
-    hidden = model.f.hidden_among(inputs, model.signals.latent_columns)
-    return replace(model, e=network.ignoring(hidden), corrected=rows)
+    unseen = model.f.hidden_among(inputs, model.signals.latent_columns)
+    return replace(model, e=network.ignoring(unseen), corrected=rows)
 
 
 def _through_terms(model: DFSM, records: Sequence[Record], coupling: Array) -> dict[int, Array]:
