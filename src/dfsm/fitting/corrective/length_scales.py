@@ -9,6 +9,7 @@ import warnings
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from dfsm.core.types import Array
 
@@ -40,6 +41,17 @@ def hyper_parameters(z: Array, targets: Array, seed: int) -> tuple[float, float,
     with warnings.catch_warnings():
         # A length scale at its bound means an input that does not matter: nothing to act on.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted: Any = GaussianProcessRegressor(kernel, random_state=seed).fit(z, targets).kernel_
+        process = GaussianProcessRegressor(kernel, optimizer=_optimum, random_state=seed)
+        fitted: Any = process.fit(z, targets).kernel_
     lengths = np.broadcast_to(fitted.k1.k2.length_scale, (d,))
     return float(fitted.k1.k1.constant_value), float(fitted.k2.noise_level), lengths
+
+
+def _optimum(cost: Any, start: Array, bounds: Array) -> tuple[Array, float]:
+    """L-BFGS-B to the rounding of the likelihood.
+
+    With the usual tolerances it stops where rounding decides, and the units of the data with it.
+    """
+    tight = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 1000}
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=tight)
+    return found.x, float(found.fun)
