@@ -24,6 +24,9 @@ if TYPE_CHECKING:
         save_solution,
         solve,
     )
+    from dfsm.controllers.bladed import BladedLibrary
+    from dfsm.controllers.discon import Discon, read_discon, write_discon
+    from dfsm.controllers.rosco import ROSCO, read_rosco
     from dfsm.core.progress import show_progress
     from dfsm.data.dataset import Dataset
     from dfsm.data.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
@@ -119,6 +122,12 @@ _HOME = {
     "DFSM": "models.dfsm",
     "SteadyState": "models.steady",
     "steady_state": "models.steady",
+    "Discon": "controllers.discon",
+    "read_discon": "controllers.discon",
+    "write_discon": "controllers.discon",
+    "ROSCO": "controllers.rosco",
+    "read_rosco": "controllers.rosco",
+    "BladedLibrary": "controllers.bladed",
     "FitSettings": "fitting.settings",
     "FitResult": "fitting.fit",
     "fit": "fitting.fit",

@@ -243,6 +243,13 @@ def write_discon(discon: Discon, path: str | Path) -> None:
     What was not changed is the same to the byte; in another folder, relative names of files are
     changed so that they name the same files.
 
+    Parameters
+    ----------
+    discon
+        What to write.
+    path
+        Where.
+
     Raises
     ------
     DfsmError

@@ -29,55 +29,26 @@ import jax.numpy as jnp
 from dfsm.controllers import rosco_wind as estimators
 from dfsm.controllers.discon import Discon, read_discon
 from dfsm.controllers.rosco_blocks import (
-    Coefficients,
-    FilterState,
     at_least,
     at_most,
     filtered,
-    high_pass,
     lookup,
     low_pass,
-    low_pass_2,
-    notch,
     proportional_integral,
     rate_limited,
-    settled,
     within,
 )
 from dfsm.controllers.rosco_deck import Modes, Power, deck_modes, deck_parameters, deck_power
+from dfsm.controllers.rosco_filters import FilterBank, Filtered, Measured, RoscoFilters
 from dfsm.controllers.signals import Signals, signals
 from dfsm.core.settings import require
 from dfsm.errors import DfsmError, near_matches
 
-# Damping of the filters on torque and pitch; pitch in rad that shifts the setpoint by SS_VSGain;
-# share of the rated speed from which ROSCO starts with rated torque.
-_DAMPING, _THIRTY_DEGREES, _RATED = 0.7, 0.524, 0.98
+# Pitch in rad that shifts the setpoint by SS_VSGain; share of the rated speed from which ROSCO
+# starts with rated torque.
+_THIRTY_DEGREES, _RATED = 0.524, 0.98
 # Margin of the region 2.5, and bounds of the nacelle's velocity in m/s or rad/s.
 _REGION, _FASTEST = 1.01, 100.0
-
-
-class Measured(NamedTuple):
-    """What comes from the turbine in SI units; the acceleration that floating feedback takes."""
-
-    speed: jax.Array
-    rotor: jax.Array
-    wind: jax.Array
-    power: jax.Array
-    acceleration: jax.Array
-
-
-class RoscoFilters(NamedTuple):
-    """States of filters: of generator and rotor speed, acceleration, wind, commands, setpoints."""
-
-    speed: tuple[FilterState, ...]
-    rotor: FilterState
-    acceleration: tuple[FilterState, ...]
-    wind: FilterState
-    torque: FilterState
-    pitch: FilterState
-    reference: FilterState
-    smoothing: FilterState
-    actuator: FilterState
 
 
 class RoscoState(NamedTuple):
@@ -119,17 +90,6 @@ class RoscoState(NamedTuple):
     power: jax.Array
 
 
-class Filtered(NamedTuple):
-    """Measurements and last commands behind their filters."""
-
-    speed: jax.Array
-    rotor: jax.Array
-    acceleration: jax.Array
-    wind: jax.Array
-    torque: jax.Array
-    pitch: jax.Array
-
-
 class ROSCO(eqx.Module):
     """A `Controller`: ROSCO of one DISCON.IN.
 
@@ -149,6 +109,8 @@ class ROSCO(eqx.Module):
     as_library
         Whether `start` is ROSCO's own start call, with torque from kω² and PIs that jump by their
         proportional parts; otherwise it takes over the commands without a jump.
+    inputs, outputs
+        The same channels by role.
     """
 
     parameters: dict[str, jax.Array]
@@ -160,8 +122,8 @@ class ROSCO(eqx.Module):
     command_units: tuple[str, ...] = eqx.field(static=True)
     interval: float = eqx.field(static=True)
     as_library: bool = eqx.field(static=True)
-    _inputs: Signals = eqx.field(static=True)
-    _outputs: Signals = eqx.field(static=True)
+    inputs: Signals = eqx.field(static=True)
+    outputs: Signals = eqx.field(static=True)
 
     def changed(self, values: Mapping[str, object]) -> ROSCO:
         """The same controller with other parameters, by key.
@@ -185,6 +147,10 @@ class ROSCO(eqx.Module):
             parameters[key] = new
         return replace(self, parameters=parameters)
 
+    @property
+    def _bank(self) -> FilterBank:
+        return FilterBank(self.parameters, self.modes, self.interval)
+
     # -- start ------------------------------------------------------------------------------------
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> RoscoState:
@@ -201,7 +167,7 @@ class ROSCO(eqx.Module):
             Torque and pitch, shape ``(command,)``.
         """
         p, m = self.parameters, self.modes
-        factors = self._outputs.factors
+        factors = self.outputs.factors
         torque, pitch = (commands[i] * factors[i] for i in range(2))
         speed = self._measured(measurements, torque).speed
         if self.as_library:
@@ -216,7 +182,7 @@ class ROSCO(eqx.Module):
         known = (0.0 * least, 0.0 * efficient) if self.as_library else (least, efficient)
         shift = self._shift(pitch, *known) if m.SS_Mode else jnp.zeros_like(speed)
         tracked = self._tracked_speed(estimator.wind, x.power, torque)
-        filters = self._settled(x, torque, pitch, tracked, shift)
+        filters = self._bank.settled(x, torque, pitch, tracked, shift)
         torque_integral, pitch_integral = torque, pitch
         gains = (p["VS_KP"], p["VS_KI"])
         above, below = p["VS_Rgn2K"] * p["VS_RefSpd"] ** 2, p["VS_Rgn2K"] * p["VS_MinOMSpd"] ** 2
@@ -271,12 +237,14 @@ class ROSCO(eqx.Module):
         """
         p, m, dt = self.parameters, self.modes, self.interval
         x = self._measured(measurements, state.torque)
-        filters, f = self._filtered(state, x)
+        filters, f = self._bank.moved(
+            state.filters, x, state.estimator.wind, (state.torque, state.pitch)
+        )
         seen = estimators.Seen(f.rotor, state.pitch, state.torque, f.torque, x.wind)
         estimator = estimators.estimated(m.WE_Mode, p, state.estimator, seen, self.power, dt)
         tracked = self._tracked_speed(estimator.wind, x.power, state.torque)
         if m.VS_ControlMode > 1:
-            reference, tracked = filtered(self._reference_filter, filters.reference, tracked)
+            reference, tracked = filtered(self._bank.reference_filter, filters.reference, tracked)
             filters = filters._replace(reference=reference)
         pitch_error = p["PC_RefSpd"] + at_least(-state.shift, 0.0) - f.speed
         torque_error = self._torque_setpoint(tracked, state.shift) - f.speed
@@ -289,7 +257,7 @@ class ROSCO(eqx.Module):
         state = self._with_torque(state, torque_error, f)
         state = self._with_pitch(state, pitch_error, f)
         command = jnp.stack([at_least(state.torque, 0.0), state.pitch])
-        return state, command / jnp.asarray(self._outputs.factors)
+        return state, command / jnp.asarray(self.outputs.factors)
 
     def _with_torque(self, state: RoscoState, error: jax.Array, f: Filtered) -> RoscoState:
         p, m, dt = self.parameters, self.modes, self.interval
@@ -347,7 +315,7 @@ class ROSCO(eqx.Module):
         sent = rate_limited(pitch, state.pitch_sent, rates, dt)
         actuator, pitch = state.filters.actuator, sent
         if m.PA_Mode:
-            actuator, pitch = filtered(self._actuator, actuator, sent)
+            actuator, pitch = filtered(self._bank.actuator, actuator, sent)
         pitch = within(pitch, p["PC_MinPit"], p["PC_MaxPit"])
         return state._replace(
             filters=state.filters._replace(actuator=actuator),
@@ -401,10 +369,10 @@ class ROSCO(eqx.Module):
             return p["PC_FinePit"] + 0.0 * wind
         return at_least(lookup(p["PS_WindSpeeds"], p["PS_BldPitchMin"], wind), p["PC_FinePit"])
 
-    # -- measurements and filters -----------------------------------------------------------------
+    # -- measurements -----------------------------------------------------------------
 
     def _measured(self, measurements: jax.Array, torque: jax.Array) -> Measured:
-        p, known = self.parameters, self._inputs
+        p, known = self.parameters, self.inputs
         found = {r: measurements[i] * known.factors[i] for i, r in enumerate(known.roles)}
         speed = found["generator_speed"]
         feedback = _FEEDBACK.get(self.modes.Fl_Mode, "")
@@ -416,101 +384,6 @@ class ROSCO(eqx.Module):
             found.get(feedback, jnp.zeros_like(speed)),
         )
 
-    def _filtered(self, state: RoscoState, x: Measured) -> tuple[RoscoFilters, Filtered]:
-        """Filters moved by one step."""
-        old, wind = state.filters, state.estimator.wind
-        speeds, speed = _chained(self._speed_filters, old.speed, x.speed)
-        rotor, rotor_speed = filtered(self._speed_filters[0], old.rotor, x.rotor)
-        accelerations, acceleration = _chained(
-            self._acceleration_filters, old.acceleration, x.acceleration
-        )
-        winds, wind = filtered(self._wind_filter, old.wind, wind)
-        torques, torque = filtered(self._torque_filter, old.torque, state.torque)
-        pitches, pitch = filtered(self._pitch_filter, old.pitch, state.pitch)
-        moved = old._replace(
-            speed=speeds,
-            rotor=rotor,
-            acceleration=accelerations,
-            wind=winds,
-            torque=torques,
-            pitch=pitches,
-        )
-        return moved, Filtered(speed, rotor_speed, acceleration, wind, torque, pitch)
-
-    def _settled(
-        self,
-        x: Measured,
-        torque: jax.Array,
-        pitch: jax.Array,
-        tracked: jax.Array,
-        shift: jax.Array,
-    ) -> RoscoFilters:
-        p, m, dt = self.parameters, self.modes, self.interval
-        zero = jnp.zeros_like(x.speed)
-
-        def at(filter_: Coefficients, value: jax.Array) -> FilterState:
-            return settled(filter_, value, value)
-
-        smoothing = at(low_pass(p["F_SSCornerFreq"], dt), shift) if m.SS_Mode else ()
-        return RoscoFilters(
-            speed=tuple(at(c, x.speed) for c in self._speed_filters),
-            rotor=at(self._speed_filters[0], x.rotor),
-            acceleration=tuple(at(c, zero) for c in self._acceleration_filters),
-            wind=at(self._wind_filter, x.wind),
-            torque=at(self._torque_filter, torque),
-            pitch=at(self._pitch_filter, pitch),
-            reference=at(self._reference_filter, tracked) if m.VS_ControlMode > 1 else (),
-            smoothing=smoothing,
-            actuator=at(self._actuator, pitch) if m.PA_Mode else (),
-        )
-
-    @property
-    def _speed_filters(self) -> tuple[Coefficients, ...]:
-        """Low-pass and notch filters of the generator's speed; the rotor's has the first."""
-        p, dt = self.parameters, self.interval
-        corner = p["F_LPFCornerFreq"]
-        first = self.modes.F_LPFType == 1
-        slow = low_pass(corner, dt) if first else low_pass_2(corner, p["F_LPFDamping"], dt)
-        return (slow, *(self._notch(i) for i in self.modes.speed_notches))
-
-    @property
-    def _acceleration_filters(self) -> tuple[Coefficients, ...]:
-        p, m, dt = self.parameters, self.modes, self.interval
-        if not m.Fl_Mode:
-            return ()
-        corner, damping = p["F_FlCornerFreq"]
-        slow, fast = low_pass_2(corner, damping, dt), high_pass(p["F_FlHighPassFreq"], dt)
-        return (slow, fast, *(self._notch(i) for i in m.acceleration_notches))
-
-    def _notch(self, i: int) -> Coefficients:
-        p = self.parameters
-        dampings = p["F_NotchBetaNum"][i], p["F_NotchBetaDen"][i]
-        return notch(p["F_NotchFreqs"][i], *dampings, self.interval)
-
-    @property
-    def _wind_filter(self) -> Coefficients:
-        return low_pass(self.parameters["F_WECornerFreq"], self.interval)
-
-    @property
-    def _torque_filter(self) -> Coefficients:
-        return low_pass_2(self.parameters["F_LPFCornerFreq"], jnp.asarray(_DAMPING), self.interval)
-
-    @property
-    def _pitch_filter(self) -> Coefficients:
-        corner = self.parameters["F_LPFCornerFreq"] * 0.25
-        return low_pass_2(corner, jnp.asarray(_DAMPING), self.interval)
-
-    @property
-    def _reference_filter(self) -> Coefficients:
-        return low_pass(self.parameters["F_VSRefSpdCornerFreq"], self.interval)
-
-    @property
-    def _actuator(self) -> Coefficients:
-        p = self.parameters
-        if self.modes.PA_Mode == 1:
-            return low_pass(p["PA_CornerFreq"], self.interval)
-        return low_pass_2(p["PA_CornerFreq"], p["PA_Damping"], self.interval)
-
 
 _FEEDBACK = {1: "nacelle_acceleration", 2: "nacelle_pitch_acceleration"}
 
@@ -519,16 +392,6 @@ def _root(root: Callable[[jax.Array], jax.Array], value: jax.Array) -> jax.Array
     """Root of what is positive, else 0; there its slope is 0, not infinite."""
     positive = value > 0
     return jnp.where(positive, root(jnp.where(positive, value, 1.0)), 0.0)
-
-
-def _chained(
-    filters: tuple[Coefficients, ...], states: tuple[FilterState, ...], value: jax.Array
-) -> tuple[tuple[FilterState, ...], jax.Array]:
-    moved = []
-    for coefficients, state in zip(filters, states, strict=True):
-        new, value = filtered(coefficients, state, value)
-        moved.append(new)
-    return tuple(moved), value
 
 
 def read_rosco(
@@ -576,6 +439,6 @@ def read_rosco(
         command_units=outputs.units,
         interval=float(interval),
         as_library=as_library,
-        _inputs=inputs,
-        _outputs=outputs,
+        inputs=inputs,
+        outputs=outputs,
     )
