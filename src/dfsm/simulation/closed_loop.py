@@ -137,6 +137,11 @@ class _Case:
     per_call: int
     scored: int
 
+    @property
+    def rows(self) -> int:
+        """Ends of plant steps within the run."""
+        return (len(self.drive.inputs) + 1) // 2
+
     def sampled(self, values: Array) -> Array:
         """Rows at the run's samples of ``(step + 1, n)``."""
         h = float(self.drive.h[0])
@@ -224,13 +229,13 @@ def prepare_loop(
             "the runs are sampled at different intervals: resample them, or set a step that is "
             "shorter than all of these"
         )
-    calls = max(len(c.drive.time) for c in cases)
+    calls = max(len(c.drive.time) for c in cases) + 1
     drives = [_padded(c, calls) for c in cases]
     scored = np.zeros((len(cases), calls * cases[0].per_call + 1))
     for i, c in enumerate(cases):
         begins = c.run.time[c.scored] - c.run.time[0]
         first = round(begins / float(c.drive.h[0]))
-        scored[i, first : (len(c.drive.inputs) + 1) // 2] = 1.0
+        scored[i, first : c.rows] = 1.0
     stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *drives)
     return ClosedLoop(model, stacked, jnp.asarray(scored), wires)
 
@@ -334,7 +339,7 @@ def _roller(model: DFSM, wires: Wires, controller: Controller) -> Callable[[_Cas
     if isinstance(controller, eqx.Module):
 
         def compiled(case: _Case) -> Path:
-            calls = -(-len(case.drive.time) // _PAD) * _PAD
+            calls = -(-(len(case.drive.time) + 1) // _PAD) * _PAD
             return roll_compiled(model, wires, controller, _padded(case, calls))
 
         return compiled
@@ -343,7 +348,7 @@ def _roller(model: DFSM, wires: Wires, controller: Controller) -> Callable[[_Cas
     def gone(x: Array) -> bool:
         return not bool(((x >= low) & (x <= high)).all())
 
-    return lambda case: host.roll(controller, case.drive, gone)
+    return lambda case: host.roll(controller, _padded(case, len(case.drive.time) + 1), gone)
 
 
 # -- preparing runs -----------------------------------------------------------------------------
@@ -424,7 +429,7 @@ def _interpolated(run: Trajectory, mesh: Array) -> Array:
 
 
 def _padded(case: _Case, calls: int) -> Drive:
-    """The drive with further calls in which nothing moves."""
+    """The drive with further calls in which nothing moves, the first at the end of the run."""
     d, more = case.drive, calls - len(case.drive.time)
     interval = float(d.h[0]) * case.per_call
     steps = more * case.per_call
@@ -453,7 +458,7 @@ def result_of(
     model: DFSM, wires: Wires, controller: Controller, case: _Case, path: Path
 ) -> ClosedLoopRun:
     """Judge how a closed loop ended, and sample it as the run."""
-    s, steps = model.signals, (len(case.drive.inputs) + 1) // 2
+    s, steps = model.signals, case.rows
     states, controls, outputs = (
         np.asarray(a)[:steps] for a in (path.states, path.controls, path.outputs)
     )

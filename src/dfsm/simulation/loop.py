@@ -102,14 +102,14 @@ def roll(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
     fields = drive.field[:-1:per_call]
     seen = wires.measured(model, drive.x0, v[0], (drive.psi0, drive.field[0]))
     begun = _plain(controller.start(seen, wires.commands_of(v[0])))
-    carry = (drive.x0, drive.psi0, v[0, : len(model.signals.controls)], begun)
+    first = v[0, jnp.array(wires.commanded)]
+    carry = (drive.x0, drive.psi0, first, begun)
 
     @jax.checkpoint
     def call(carry: Any, drive: Any) -> tuple[Any, Any]:
         x, psi, held, state = carry
         time, h, legs, field = drive
-        now = legs[0][0].at[jnp.array(wires.commanded)].set(held[jnp.array(wires.commanded)])
-        seen = wires.measured(model, x, now, (psi, field))
+        seen = wires.measured(model, x, wires.with_commands(legs[0][0], held), (psi, field))
         new, commands = controller.step(state, seen, time)
         state, commands = _like(new, state), wires.in_model_units(_checked(commands, wires))
         path = []
@@ -117,8 +117,7 @@ def roll(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
             path.append(x)
             ends = tuple(wires.with_commands(part[leg], commands) for part in legs)
             x, psi = _plant_step(model, x, psi, h, ends)
-        held = wires.with_commands(now, commands)[: held.shape[0]]
-        return (x, psi, held, state), (jnp.stack(path), commands, seen)
+        return (x, psi, commands, state), (jnp.stack(path), commands, seen)
 
     (last, *_), (xs, commands, seen) = jax.lax.scan(call, carry, (drive.time, drive.h, legs, fields))
     states = jnp.concatenate([xs.reshape(steps, -1), last[None]])
@@ -239,7 +238,8 @@ class HostLoop:
         Path
             Not a number from where the loop was stopped.
         """
-        wires, v, field = self.wires, np.asarray(drive.inputs), np.asarray(drive.field)
+        wires, drive = self.wires, jax.tree.map(np.asarray, drive)
+        v, field = drive.inputs, drive.field
         calls, steps = len(drive.time), (len(v) - 1) // 2
         per_call = steps // calls
         states = np.full((steps + 1, len(drive.x0)), np.nan)
@@ -267,7 +267,6 @@ class HostLoop:
             close = getattr(state, "close", None)
             if close is not None:
                 close()
-        commands[-1] = commands[-2]
         inputs = wires.with_commands(jnp.asarray(v[::2]), wires.in_model_units(jnp.asarray(commands)))
         h = jnp.repeat(jnp.asarray(drive.h), per_call)
         outputs, outside = self._observed(

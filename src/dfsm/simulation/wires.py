@@ -81,8 +81,17 @@ class Wires:
         return exogenous[jnp.array(self.commanded)] / jnp.array(self.command_factors)
 
     def with_commands(self, exogenous: jax.Array, commands: jax.Array) -> jax.Array:
-        """Exogenous inputs ``(..., exogenous)`` with the controls set, in the model's units."""
-        return exogenous.at[..., jnp.array(self.commanded)].set(commands)
+        """Exogenous inputs ``(..., exogenous)`` with the controls set, in the model's units.
+
+        Controls stand first among them. Put together instead of written over: XLA compiles no loop
+        in one piece that holds a scatter.
+        """
+        last = max(self.commanded, default=-1) + 1
+        columns = [
+            commands[..., self.commanded.index(i)] if i in self.commanded else exogenous[..., i]
+            for i in range(last)
+        ]
+        return jnp.concatenate([jnp.stack(columns, axis=-1), exogenous[..., last:]], axis=-1)
 
     def in_model_units(self, commands: jax.Array) -> jax.Array:
         """Commands ``(..., command)`` of the controller in the model's units."""
