@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dfsm.cli.closed_loop import closed_loop
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
@@ -42,6 +43,7 @@ app.command("export-rosco")(export_rosco)
 app.command("check-run")(check_run)
 app.command()(calibrate)
 app.command()(wind)
+app.command("closed-loop")(closed_loop)
 
 IntervalFile = Annotated[
     Path | None, typer.Option("--intervals", help="Prediction intervals made by dfsm calibrate.")

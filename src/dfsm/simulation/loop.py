@@ -119,7 +119,9 @@ def roll(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
             x, psi = _plant_step(model, x, psi, h, ends)
         return (x, psi, commands, state), (jnp.stack(path), commands, seen)
 
-    (last, *_), (xs, commands, seen) = jax.lax.scan(call, carry, (drive.time, drive.h, legs, fields))
+    (last, *_), (xs, commands, seen) = jax.lax.scan(
+        call, carry, (drive.time, drive.h, legs, fields)
+    )
     states = jnp.concatenate([xs.reshape(steps, -1), last[None]])
     commands = jnp.repeat(commands, per_call, axis=0)
     inputs = wires.with_commands(v[::2], jnp.concatenate([commands, commands[-1:]]))
@@ -181,6 +183,13 @@ def _checked(commands: Any, wires: Wires) -> jax.Array:
 def roll_compiled(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
     """`roll`, compiled; models, controllers and runs of the same shapes share one compilation."""
     return roll(model.prepared(), wires, controller, drive)
+
+
+@eqx.filter_jit
+def roll_many(model: DFSM, wires: Wires, controllers: Any, drive: Drive) -> Path:
+    """`roll` with several controllers side by side, whose numbers have a leading axis."""
+    model = model.prepared()
+    return jax.vmap(lambda controller: roll(model, wires, controller, drive))(controllers)
 
 
 # -- on the host --------------------------------------------------------------------------------
@@ -267,7 +276,9 @@ class HostLoop:
             close = getattr(state, "close", None)
             if close is not None:
                 close()
-        inputs = wires.with_commands(jnp.asarray(v[::2]), wires.in_model_units(jnp.asarray(commands)))
+        inputs = wires.with_commands(
+            jnp.asarray(v[::2]), wires.in_model_units(jnp.asarray(commands))
+        )
         h = jnp.repeat(jnp.asarray(drive.h), per_call)
         outputs, outside = self._observed(
             self.model, h, jnp.asarray(states), (inputs, drive.field), jnp.asarray(drive.psi0)

@@ -137,7 +137,7 @@ def _compare(
     rates = differentiate(run, s.specs, s.derivatives)
     inside = rates.trajectory.window(*window)
     rows = np.isin(rates.trajectory.time, inside.time)
-    recorded = _recorded(first, run.window(*window), inside)
+    recorded = recorded_states(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
     results = {}
     for name, model in models.items():
@@ -152,7 +152,7 @@ def _compare(
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
                 errors[c.name] = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
-            statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
+            statistics = all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
                 shares = intervals.coverage(simulation, run, recorded)
@@ -167,7 +167,7 @@ def _compare(
         )
     return RunComparison(
         recorded=recorded,
-        statistics=_all_statistics(recorded, bands, s.names("outputs")),
+        statistics=all_statistics(recorded, bands, s.names("outputs")),
         models=results,
         parameters={name: float(inside[name][0]) for name in s.names("parameters")},
     )
@@ -185,7 +185,7 @@ def _simulate_warm(
         return simulate(model, run, start=window[0], stop=window[1], settings=settings)
 
 
-def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
+def recorded_states(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
     """States and outputs to compare with: measured ones as recorded, rates as extracted."""
     channels = (*model.signals.observed, *model.signals.outputs)
     names = [c.name for c in channels]
@@ -223,9 +223,10 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
     return PLATFORM, WAVE, Band(f"{azimuth.blades}P", 0.8 * passing, 1.2 * passing), LOW
 
 
-def _all_statistics(
+def all_statistics(
     run: Trajectory, bands: Sequence[Band], loads: Sequence[str]
 ) -> dict[str, ChannelStatistics]:
+    """Statistics of all channels of a run; damage-equivalent loads of those named in `loads`."""
     if run.time_step is None:
         # Spectra need an equidistant mesh; the median step keeps what the samples resolve.
         step = float(np.median(np.diff(run.time)))
