@@ -86,6 +86,7 @@ class Wires:
         Controls stand first among them. Put together instead of written over: XLA compiles no loop
         in one piece that holds a scatter.
         """
+        commands = jnp.broadcast_to(commands, (*exogenous.shape[:-1], len(self.commanded)))
         last = max(self.commanded, default=-1) + 1
         columns = [
             commands[..., self.commanded.index(i)] if i in self.commanded else exogenous[..., i]
