@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     )
     from dfsm.controllers.actuator import Actuator
     from dfsm.controllers.bladed import BladedLibrary
-    from dfsm.controllers.controller import Controller
     from dfsm.controllers.discon import Discon, read_discon, write_discon
     from dfsm.controllers.pid import PID
     from dfsm.controllers.rosco import ROSCO, read_rosco
@@ -140,7 +139,6 @@ _HOME = {
     "ROSCO": "controllers.rosco",
     "read_rosco": "controllers.rosco",
     "BladedLibrary": "controllers.bladed",
-    "Controller": "controllers.controller",
     "PID": "controllers.pid",
     "StateFeedback": "controllers.state_space",
     "StateSpace": "controllers.state_space",
