@@ -24,9 +24,13 @@ if TYPE_CHECKING:
         save_solution,
         solve,
     )
+    from dfsm.controllers.actuator import Actuator
     from dfsm.controllers.bladed import BladedLibrary
     from dfsm.controllers.discon import Discon, read_discon, write_discon
+    from dfsm.controllers.pid import PID
     from dfsm.controllers.rosco import ROSCO, read_rosco
+    from dfsm.controllers.sensor import Sensor
+    from dfsm.controllers.state_space import StateFeedback, StateSpace
     from dfsm.core.progress import show_progress
     from dfsm.data.dataset import Dataset
     from dfsm.data.derivatives import DerivativeSettings, Filter, StateSpec, differentiate
@@ -50,6 +54,9 @@ if TYPE_CHECKING:
     from dfsm.fitting.linear import LPV, LTI
     from dfsm.fitting.settings import FitSettings
     from dfsm.loops.adaptive import AdaptiveResult, AdaptiveSettings, optimize_adaptively
+    from dfsm.loops.load_cases import weibull_weights
+    from dfsm.loops.regulator import linear_quadratic
+    from dfsm.loops.sweep import Sweep, SweepSettings, sweep
     from dfsm.models.dfsm import DFSM
     from dfsm.models.model_folder import load, load_all, save
     from dfsm.models.signals import Azimuth
@@ -60,6 +67,9 @@ if TYPE_CHECKING:
     from dfsm.report import write_report, write_solution_report
     from dfsm.selection.compare import RankedCandidate, Ranking, compare
     from dfsm.selection.trial import Candidate, Outcome
+    from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
+    from dfsm.simulation.loop_cases import ClosedLoopSettings
+    from dfsm.simulation.prepared_loop import ClosedLoop, prepare_loop
     from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
     from dfsm.simulators import ODESystem, mass_chain, two_link_robot, two_link_robot_with_gravity
     from dfsm.simulators.excitation import (
@@ -71,6 +81,7 @@ if TYPE_CHECKING:
         excite,
     )
     from dfsm.validation.calibrate import calibrate
+    from dfsm.validation.closed_loop import ClosedLoopValidation, validate_closed_loop
     from dfsm.validation.intervals import Intervals, load_intervals
     from dfsm.validation.results import Validation
     from dfsm.validation.validate import compared, validate
@@ -131,6 +142,11 @@ _HOME = {
     "ROSCO": "controllers.rosco",
     "read_rosco": "controllers.rosco",
     "BladedLibrary": "controllers.bladed",
+    "PID": "controllers.pid",
+    "StateFeedback": "controllers.state_space",
+    "StateSpace": "controllers.state_space",
+    "Actuator": "controllers.actuator",
+    "Sensor": "controllers.sensor",
     "FitSettings": "fitting.settings",
     "FitResult": "fitting.fit",
     "fit": "fitting.fit",
@@ -144,9 +160,17 @@ _HOME = {
     "Simulation": "simulation.simulate",
     "SimulationSettings": "simulation.simulate",
     "simulate": "simulation.simulate",
+    "closed_loop": "simulation.closed_loop",
+    "ClosedLoopRun": "simulation.closed_loop",
+    "LoopStatus": "simulation.closed_loop",
+    "ClosedLoopSettings": "simulation.loop_cases",
+    "prepare_loop": "simulation.prepared_loop",
+    "ClosedLoop": "simulation.prepared_loop",
     "Validation": "validation.results",
     "compared": "validation.validate",
     "validate": "validation.validate",
+    "validate_closed_loop": "validation.closed_loop",
+    "ClosedLoopValidation": "validation.closed_loop",
     "Candidate": "selection.trial",
     "Outcome": "selection.trial",
     "RankedCandidate": "selection.compare",
@@ -166,6 +190,11 @@ _HOME = {
     "AdaptiveSettings": "loops.adaptive",
     "AdaptiveResult": "loops.adaptive",
     "optimize_adaptively": "loops.adaptive",
+    "linear_quadratic": "loops.regulator",
+    "sweep": "loops.sweep",
+    "Sweep": "loops.sweep",
+    "SweepSettings": "loops.sweep",
+    "weibull_weights": "loops.load_cases",
     "RunCheck": "control",
     "check_run": "control",
     "RoscoInput": "exports.rosco",

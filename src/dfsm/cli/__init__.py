@@ -17,6 +17,7 @@ from typing import Annotated
 
 import typer
 
+from dfsm.cli.closed_loop import closed_loop
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
@@ -63,6 +64,7 @@ app.command("export-rosco")(export_rosco)
 app.command("check-run")(check_run)
 app.command()(calibrate)
 app.command()(wind)
+app.command("closed-loop")(closed_loop)
 
 
 @app.command()

@@ -234,7 +234,7 @@ def _march(
         return rk4(model, x0, h, stages(v, drive[2]))
 
     xs = jax.vmap(states)(jnp.asarray(x0), jnp.asarray(h), inputs)
-    seen = _observe(model, jnp.asarray(h), xs, (inputs[:, ::2], field), jnp.asarray(psi0))
+    seen = observe(model, jnp.asarray(h), xs, (inputs[:, ::2], field), jnp.asarray(psi0))
     return xs, *seen
 
 
@@ -302,14 +302,14 @@ def rate(model: DFSM, x: jax.Array, v: jax.Array) -> jax.Array:
     return model.derivative(x, *model.signals.order.split_exogenous(v))
 
 
-def _observe(
+def observe(
     model: DFSM,
     h: jax.Array,
     xs: jax.Array,
     drive: tuple[jax.Array, jax.Array],
     psi0: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Outputs along rollouts ``(..., time, n)`` and whether any input is outside its range.
+    """Outputs along rollouts ``(..., time, n)``, and whether any input is outside its range.
 
     `drive` are the exogenous inputs and the wind field. The azimuth is the integral of the
     rollout's own speed.
@@ -404,5 +404,5 @@ def _adapt(
         throw=False,
     )
     states = jnp.asarray(solution.ys) * spread
-    outputs, outside = _observe(model, jnp.diff(samples), states, (values, field), psi0)
+    outputs, outside = observe(model, jnp.diff(samples), states, (values, field), psi0)
     return states, outputs, outside, solution.result == diffrax.RESULTS.successful

@@ -42,7 +42,7 @@ from dfsm.simulation.integrate import (
 )
 
 # A rollout ends where a state is this many times its training half-range from the middle.
-_ESCAPE = 10.0
+ESCAPE = 10.0
 # Share of the time outside the training range above which a user is warned.
 MUCH_OUTSIDE = 0.05
 # Rates at the start are taken from this much of the record before it (or, where the record starts
@@ -246,7 +246,7 @@ def simulate(
         x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
-        return Case(drive, x0, _initial_azimuth(model, batch[i], begins), field)
+        return Case(drive, x0, initial_azimuth(model, batch[i], begins), field)
 
     def marched(i: int) -> Case[Mesh]:
         mesh = mesh_of(driven[i], steps[i].largest, between)
@@ -365,7 +365,8 @@ def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     return extracted.trajectory.select(extracted.names).values[row]
 
 
-def _initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
+def initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
+    """Recorded azimuth at `start` in rad; 0 where no channel holds it."""
     azimuth = model.signals.azimuth
     if azimuth is None or azimuth.angle is None or azimuth.angle not in run:
         return 0.0
@@ -382,7 +383,7 @@ def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) 
     middle, half = (low + high) / 2, (high - low) / 2
     x = rollout.states
     finite = np.isfinite(x)
-    escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > _ESCAPE * half)
+    escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > ESCAPE * half)
     rows = np.flatnonzero(escaped.any(axis=1))
     end = int(rows[0]) if len(rows) else len(x)
     status, reason = Status.COMPLETED, ""

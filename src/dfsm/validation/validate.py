@@ -154,7 +154,7 @@ def _compare(
     s = first.signals
     seen = recorded_states(first, run, window[0])
     inside = seen.trajectory.window(*window)
-    recorded = _recorded(first, run.window(*window), inside)
+    recorded = recorded_signals(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
     weights = weights_over_time([recorded.time])
     usual = training_spreads(first)
@@ -169,7 +169,7 @@ def _compare(
                 rollout, true = simulation.trajectory[c.name], recorded[c.name]
                 error = ChannelError.of(rollout, true, weights)
                 errors[c.name] = error.unless_still(true, usual.get(c.name, 0.0))
-            statistics = _all_statistics(simulation.trajectory, bands, s.names("outputs"))
+            statistics = all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
                 shares = intervals.coverage(simulation, run, recorded)
@@ -184,7 +184,7 @@ def _compare(
         )
     return RunComparison(
         recorded=recorded,
-        statistics=_all_statistics(recorded, bands, s.names("outputs")),
+        statistics=all_statistics(recorded, bands, s.names("outputs")),
         models=results,
         parameters={name: float(inside[name][0]) for name in s.names("parameters")},
     )
@@ -202,7 +202,7 @@ def _simulate_warm(
         return simulate(model, run, start=window[0], stop=window[1], settings=settings)
 
 
-def _recorded(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
+def recorded_signals(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
     """States and outputs to compare with: measured ones as recorded, rates as extracted."""
     channels = (*model.signals.observed, *model.signals.outputs)
     names = [c.name for c in channels]
@@ -256,9 +256,10 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
     return PLATFORM, WAVE, Band(f"{azimuth.blades}P", 0.8 * passing, 1.2 * passing), LOW
 
 
-def _all_statistics(
+def all_statistics(
     run: Trajectory, bands: Sequence[Band], loads: Sequence[str]
 ) -> dict[str, ChannelStatistics]:
+    """Statistics of all channels of a run; damage-equivalent loads of those named in `loads`."""
     if run.time_step is None:
         # Spectra need an equidistant mesh; the median step keeps what the samples resolve, unless
         # most of them stand for next to no time.

@@ -1,0 +1,173 @@
+"""The command that closes the loop on a model; `cli` puts it beside the others."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, print_json, say, working
+from dfsm.errors import DfsmError, hushed, near_matches
+
+if TYPE_CHECKING:
+    from dfsm.controllers.controller import Controller
+
+_HOLDS = "--controller names a DISCON.IN, or a Python file and what it holds as in control.py:mine"
+
+
+def closed_loop(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    files: Files,
+    controller: Annotated[
+        str, typer.Option(help="ROSCO's DISCON.IN, or file.py:name of a controller of your own.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for one Parquet file per run.")
+    ],
+    library: Annotated[
+        Path | None,
+        typer.Option(help="Bladed-style library that reads the DISCON.IN; default ROSCO in JAX."),
+    ] = None,
+    interval: Annotated[
+        float | None,
+        typer.Option(help="Seconds between two calls of ROSCO; default the runs' samples."),
+    ] = None,
+    measure: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Signal of the model that stands for a measurement: "
+            "NcIMURAys=PtfmPitch_dot_dot. Several times if need be."
+        ),
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    start: Annotated[
+        float | None, typer.Option(help="Start of the scored time in s; default as in the fit.")
+    ] = None,
+    stop: Annotated[float | None, typer.Option(help="End of the scored time in s.")] = None,
+    start_up: Annotated[
+        float, typer.Option(help="Seconds that the loop runs before what is scored.")
+    ] = 60.0,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Close the loop between a model and a controller, and compare with what was recorded."""
+    from dfsm.cli.tables import print_article
+    from dfsm.core.files import check_file, write_json
+    from dfsm.data.readers import read_all
+    from dfsm.data.readers.tables import write_table
+    from dfsm.models.model_folder import load
+    from dfsm.report.article_page import write_article
+    from dfsm.report.closed_loop_article import closed_loop_article
+    from dfsm.simulation.loop_cases import ClosedLoopSettings
+    from dfsm.validation.closed_loop import validate_closed_loop
+
+    settings = ClosedLoopSettings(start_up=start_up)
+    stand_ins = _pairs(measure or [])
+    surrogate = load(model)
+    start = fit_start(surrogate) if start is None else start
+    output.mkdir(parents=True, exist_ok=True)
+    figures = output / "closed_loop.json"
+    with working(quiet), hushed():  # the outcome is printed below
+        runs = read_all(files)
+        targets = {run.name: output / f"{run.name}.parquet" for run in runs}
+        for target in (*targets.values(), figures, *([report] if report else [])):
+            check_file(target, [run.source for run in runs])
+        sampled = runs[0].time_step
+        law = _controller(controller, library, interval or sampled)
+        validation = validate_closed_loop(
+            surrogate,
+            runs,
+            law,
+            start=start,
+            stop=stop,
+            measurements=stand_ins,
+            settings=settings,
+        )
+    for compared in validation.runs:
+        write_table(compared.loop.trajectory, targets[compared.recorded.name])
+    write_json(figures, validation.to_dict())
+    article = closed_loop_article(validation, model.name or str(model), controller)
+    if report is not None:
+        write_article(article, report)
+    if as_json:
+        print_json(validation.to_dict())
+    elif not quiet:
+        print_article(article)
+        if kept := [n for n in surrogate.signals.names("controls") if n not in law.commands]:
+            say(f"the controller does not set {', '.join(kept)}: as recorded", quiet)
+        say(f"wrote {output} ({len(runs)} runs) and {figures}", quiet)
+        if report is not None:
+            say(f"wrote {report}", quiet)
+    for text in validation.endings():
+        if not quiet:
+            print(text, file=sys.stderr)
+    if validation.completed < len(validation.runs):
+        raise typer.Exit(1)
+
+
+def _pairs(texts: list[str]) -> dict[str, str]:
+    pairs = dict[str, str]()
+    for text in texts:
+        name, sign, signal = text.partition("=")
+        if not (name and sign and signal):
+            raise DfsmError(
+                f"--measure is '{text}', expected a measurement and a signal of the model as in "
+                "NcIMURAys=PtfmPitch_dot_dot"
+            )
+        pairs[name] = signal
+    return pairs
+
+
+def _controller(text: str, library: Path | None, interval: float | None) -> Controller:
+    """ROSCO, a library, or an object of a Python file."""
+    path, sign, name = text.rpartition(":")
+    if sign and path.endswith(".py"):
+        if library is not None:
+            raise DfsmError("--library goes with a DISCON.IN, not with a controller in Python")
+        return _own(Path(path), name)
+    if text.endswith(".py"):
+        raise DfsmError(f"--controller is '{text}' without a name: {_HOLDS}")
+    if interval is None:
+        raise DfsmError(
+            "the runs have no common sampling interval: set the controller's --interval"
+        )
+    if library is not None:
+        from dfsm.controllers.bladed import BladedLibrary
+
+        return BladedLibrary(library, Path(text), interval=interval)
+    from dfsm.controllers.rosco import read_rosco
+
+    return read_rosco(text, interval=interval)
+
+
+def _own(path: Path, name: str) -> Controller:
+    from dfsm.controllers.controller import Controller
+    from dfsm.core.files import existing_file
+
+    path = existing_file(path)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise DfsmError(f"{path} is no Python file: {_HOLDS}")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up.
+    sys.modules[path.stem] = module
+    try:
+        spec.loader.exec_module(module)
+    except DfsmError:
+        raise
+    except Exception as error:
+        raise DfsmError(f"{path} fails with {type(error).__name__}: {error}") from None
+    if not hasattr(module, name):
+        known = [n for n in vars(module) if not n.startswith("_")]
+        raise DfsmError(f"{path} holds no '{name}'; {near_matches(name, known)}")
+    found = getattr(module, name)
+    found = found() if isinstance(found, type) else found
+    if not isinstance(found, Controller):
+        raise DfsmError(
+            f"'{name}' of {path} is no controller: it needs measurements, measurement_units, "
+            "commands, command_units, interval, start and step"
+        )
+    return found

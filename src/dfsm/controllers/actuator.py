@@ -1,0 +1,131 @@
+"""Actuators behind a controller: second-order dynamics, limits of rate and range."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.controllers.rosco_blocks import within
+from dfsm.controllers.traced import traced
+from dfsm.core.settings import require
+from dfsm.errors import DfsmError, missing
+
+
+class ActuatorState(NamedTuple):
+    """The controller's state; position and velocity; what takes them over one interval."""
+
+    inner: Any
+    position: jax.Array
+    velocity: jax.Array
+    moves: jax.Array
+
+
+class Actuator(eqx.Module):
+    """A `Controller` whose commands reach the plant through an actuator.
+
+        p̈ = ω² (u - p) - 2 ζ ω ṗ,      |ṗ| and p within their limits
+
+    exact over an interval for a command that is held, then limited. An actuator that only limits
+    has no `corner`. Wrap twice for two commands with different actuators.
+
+    Attributes
+    ----------
+    inner
+        The controller.
+    corner, damping
+        ω in rad/s, None for none, and ζ.
+    rate
+        Largest rate of change, in the command's unit per s.
+    limits
+        Lowest and highest position.
+    acts_on
+        Commands that it is for; None for all.
+
+    Raises
+    ------
+    DfsmError
+        A command that the controller does not set, or limits the wrong way round.
+    """
+
+    inner: Any
+    corner: jax.Array | None = None
+    damping: jax.Array = eqx.field(converter=jnp.asarray, default=0.7)  # pyright: ignore[reportAssignmentType]
+    rate: jax.Array = eqx.field(converter=jnp.asarray, default=np.inf)  # pyright: ignore[reportAssignmentType]
+    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+    acts_on: tuple[str, ...] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if lost := [n for n in self.acts_on or () if n not in self.inner.commands]:
+            raise DfsmError(f"acts_on: the controller sets {missing(lost, self.inner.commands)}")
+        if traced(self):
+            return
+        require(bool(np.all(np.asarray(self.rate) > 0)), "rate", self.rate, "more than 0")
+        low, high = (np.asarray(limit) for limit in self.limits)
+        require(bool((low < high).all()), "limits", self.limits, "the lower one first")
+
+    @property
+    def measurements(self) -> tuple[str, ...]:
+        """Those of the controller."""
+        return self.inner.measurements
+
+    @property
+    def measurement_units(self) -> tuple[str, ...]:
+        """Those of the controller."""
+        return self.inner.measurement_units
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Those of the controller."""
+        return self.inner.commands
+
+    @property
+    def command_units(self) -> tuple[str, ...]:
+        """Those of the controller."""
+        return self.inner.command_units
+
+    @property
+    def interval(self) -> float:
+        """That of the controller."""
+        return self.inner.interval
+
+    def start(self, measurements: jax.Array, commands: jax.Array) -> ActuatorState:
+        """At rest where the plant's controls are; see `Controller.start`."""
+        position = commands[self._columns]
+        moves = jnp.zeros((2, 2))
+        if self.corner is not None:
+            square, slope = self.corner**2, 2 * self.damping * self.corner
+            zero, one = jnp.zeros_like(square), jnp.ones_like(square)
+            rate = jnp.stack([jnp.stack([zero, one]), jnp.stack([-square, -slope])])
+            moves = jax.scipy.linalg.expm(rate * self.interval)
+        inner = self.inner.start(measurements, commands)
+        return ActuatorState(inner, position, jnp.zeros_like(position), moves)
+
+    def step(
+        self, state: ActuatorState, measurements: jax.Array, time: jax.Array
+    ) -> tuple[ActuatorState, jax.Array]:
+        """Next state, and commands; see `Controller.step`."""
+        inner, commands = self.inner.step(state.inner, measurements, time)
+        wanted = commands[self._columns]
+        position, velocity = wanted, state.velocity
+        if self.corner is not None:
+            away = state.position - wanted
+            position = wanted + state.moves[0, 0] * away + state.moves[0, 1] * velocity
+            velocity = state.moves[1, 0] * away + state.moves[1, 1] * velocity
+        most = self.rate * self.interval
+        limited = within(position, state.position - most, state.position + most)
+        limited = within(limited, *self.limits)
+        # What runs into a limit goes on at the rate that it has there.
+        velocity = jnp.where(
+            limited == position, velocity, (limited - state.position) / self.interval
+        )
+        commands = commands.at[self._columns].set(limited)
+        return ActuatorState(inner, limited, velocity, state.moves), commands
+
+    @property
+    def _columns(self) -> Any:
+        chosen = self.inner.commands if self.acts_on is None else self.acts_on
+        return np.array([self.inner.commands.index(n) for n in chosen])

@@ -1,0 +1,126 @@
+"""PI and PID with anti-windup, limits and gains that follow a schedule."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.controllers.rosco_blocks import lookup, within
+from dfsm.controllers.traced import traced
+from dfsm.core.settings import require
+
+
+class PIDState(NamedTuple):
+    """Integral part of the command, and the measurement behind the derivative's filter."""
+
+    integral: jax.Array
+    smooth: jax.Array
+
+
+class PID(eqx.Module):
+    """A `Controller` of one command by one measurement: u = kp e + ki ∫e dt - kd dy/dt.
+
+    e is the setpoint less the measurement y; the integral takes the error of its own step (backward
+    Euler). At a limit the integral waits unless the error leads away from the limit, so that
+    nothing winds up, and it stays within the limits itself.
+
+    Attributes
+    ----------
+    kp, ki, kd
+        Gains; with a schedule, one value per point, linear between and constant beyond.
+    setpoint
+        What the measurement is to be.
+    points
+        Values of the schedule at which gains are given, rising, shape ``(point,)``; None without.
+    limits
+        Lowest and highest command.
+    smoothing
+        Time constant of the derivative's low-pass in s; 0 for none.
+    measurements, measurement_units
+        The measurement, and the schedule's if there is one.
+    commands, command_units
+        The command.
+    interval
+        Time between two calls in s.
+
+    Raises
+    ------
+    DfsmError
+        An interval that is not positive, limits the wrong way round, or a schedule without points.
+    """
+
+    kp: jax.Array = eqx.field(converter=jnp.asarray)
+    ki: jax.Array = eqx.field(converter=jnp.asarray)
+    measurements: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    commands: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    command_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    interval: float = eqx.field(static=True)
+    setpoint: jax.Array = eqx.field(converter=jnp.asarray)
+    kd: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
+    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+    points: jax.Array | None = None
+    smoothing: float = eqx.field(static=True, default=0.0)
+
+    def __check_init__(self) -> None:
+        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
+        require(self.smoothing >= 0, "smoothing", self.smoothing, "seconds, at least 0")
+        scheduled = self.points is not None
+        require(
+            len(self.measurements) == 1 + scheduled,
+            "measurements",
+            self.measurements,
+            "what is controlled and, with points, what the gains follow",
+        )
+        require(len(self.commands) == 1, "commands", self.commands, "one")
+        if traced(self):
+            return
+        low, high = (float(limit) for limit in self.limits)
+        require(low < high, "limits", (low, high), "the lower one first")
+        if self.points is not None:
+            rising = bool((np.diff(np.asarray(self.points)) > 0).all())
+            require(rising, "points", np.asarray(self.points).tolist(), "values that rise")
+
+    def start(self, measurements: jax.Array, commands: jax.Array) -> PIDState:
+        """State whose first step continues the command, as far as the limits allow.
+
+        Parameters
+        ----------
+        measurements, commands
+            Shapes ``(measurement,)`` and ``(1,)``.
+        """
+        y = measurements[0]
+        kp = self._gain(self.kp, measurements)
+        step = self.interval * self._gain(self.ki, measurements) * (self.setpoint - y)
+        integral = commands[0] - (kp * (self.setpoint - y) + step)
+        return PIDState(within(integral, *self.limits), y)
+
+    def step(
+        self,
+        state: PIDState,
+        measurements: jax.Array,
+        time: jax.Array,  # noqa: ARG002
+    ) -> tuple[PIDState, jax.Array]:
+        """Next state, and the command, shape ``(1,)``; see `Controller.step`."""
+        y, dt = measurements[0], self.interval
+        kp, ki, kd = (self._gain(gain, measurements) for gain in (self.kp, self.ki, self.kd))
+        error = self.setpoint - y
+        slope = (y - state.smooth) / (self.smoothing + dt)
+        smooth = state.smooth + dt * slope
+        moved = within(state.integral + dt * ki * error, *self.limits)
+        direct = kp * error - kd * slope
+        wanted = direct + moved
+        low, high = self.limits
+        # Integrating further would lead the command farther beyond its limit.
+        waits = ((wanted > high) & (ki * error > 0)) | ((wanted < low) & (ki * error < 0))
+        integral = jnp.where(waits, state.integral, moved)
+        return PIDState(integral, smooth), within(direct + integral, *self.limits)[None]
+
+    def _gain(self, gain: jax.Array, measurements: jax.Array) -> jax.Array:
+        if self.points is None or gain.ndim == 0:
+            return gain
+        return lookup(jnp.asarray(self.points), gain, measurements[1])

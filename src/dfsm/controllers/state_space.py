@@ -1,0 +1,192 @@
+"""Linear controllers in discrete time: a state space, and state feedback with integral action."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import LinAlgError, solve_discrete_are
+from scipy.signal import cont2discrete
+
+from dfsm.controllers.rosco_blocks import within
+from dfsm.core.settings import require
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError
+
+
+class StateSpace(eqx.Module):
+    """A `Controller` in discrete time about an operating point.
+
+        z' = A z + B (y - y₀),      u = u₀ + C z + D (y - y₀)
+
+    Attributes
+    ----------
+    A, B, C, D
+        Shapes ``(state, state)``, ``(state, measurement)``, ``(command, state)`` and
+        ``(command, measurement)``.
+    y0, u0
+        Measurements and commands about which it is linear.
+    limits
+        Lowest and highest commands, numbers or shape ``(command,)``.
+    measurements, measurement_units, commands, command_units, interval
+        See `Controller`.
+
+    Raises
+    ------
+    DfsmError
+        Shapes that do not fit each other.
+    """
+
+    A: jax.Array = eqx.field(converter=jnp.asarray)
+    B: jax.Array = eqx.field(converter=jnp.asarray)
+    C: jax.Array = eqx.field(converter=jnp.asarray)
+    D: jax.Array = eqx.field(converter=jnp.asarray)
+    measurements: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    commands: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    command_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    interval: float = eqx.field(static=True)
+    y0: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
+    u0: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
+    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+
+    def __check_init__(self) -> None:
+        n, m, p = len(self.A), len(self.measurements), len(self.commands)
+        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
+        for name, shape in (("A", (n, n)), ("B", (n, m)), ("C", (p, n)), ("D", (p, m))):
+            matrix = getattr(self, name)
+            require(matrix.shape == shape, f"{name} of shape", matrix.shape, f"shape {shape}")
+
+    def start(self, measurements: jax.Array, commands: jax.Array) -> jax.Array:
+        """State whose command is this one, and among those the one nearest to rest."""
+        y = measurements - self.y0
+        push, away = self.B @ y, jnp.eye(len(self.A)) - self.A
+        inverse = jnp.linalg.pinv(self.C)
+        particular = inverse @ (commands - self.u0 - self.D @ y)
+        free = jnp.eye(len(self.A)) - inverse @ self.C
+        rest = jnp.linalg.pinv(away @ free) @ (push - away @ particular)
+        return particular + free @ rest
+
+    def step(
+        self,
+        state: jax.Array,
+        measurements: jax.Array,
+        time: jax.Array,  # noqa: ARG002
+    ) -> tuple[jax.Array, jax.Array]:
+        """Next state, and commands; see `Controller.step`."""
+        y = measurements - self.y0
+        commands = self.u0 + self.C @ state + self.D @ y
+        return self.A @ state + self.B @ y, within(commands, *self.limits)
+
+
+class StateFeedback(eqx.Module):
+    """A `Controller` u = u₀ - K (x - x₀) - K_i ∫(x - x₀) dt of the measured states.
+
+    Where a command is at a limit, integrals wait unless they lead away from it.
+
+    Attributes
+    ----------
+    gain
+        K, shape ``(command, measurement)``.
+    integral_gain
+        K_i of the same shape, zero in columns of states that are not integrated; None for static
+        feedback.
+    x0, u0
+        States and controls of the operating point, in the controller's units.
+    limits
+        Lowest and highest commands, numbers or shape ``(command,)``.
+    measurements, measurement_units, commands, command_units, interval
+        See `Controller`.
+
+    Raises
+    ------
+    DfsmError
+        A gain of another shape.
+    """
+
+    gain: jax.Array = eqx.field(converter=jnp.asarray)
+    x0: jax.Array = eqx.field(converter=jnp.asarray)
+    u0: jax.Array = eqx.field(converter=jnp.asarray)
+    measurements: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    commands: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    command_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    interval: float = eqx.field(static=True)
+    integral_gain: jax.Array | None = None
+    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+
+    def __check_init__(self) -> None:
+        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
+        shape = (len(self.commands), len(self.measurements))
+        for name in ("gain", "integral_gain"):
+            gain = getattr(self, name)
+            if gain is not None:
+                require(gain.shape == shape, f"{name} of shape", gain.shape, f"shape {shape}")
+
+    def start(self, measurements: jax.Array, commands: jax.Array) -> jax.Array:
+        """What integrals add to the commands, such that the first step continues these."""
+        if self.integral_gain is None:
+            return jnp.zeros(0)
+        error = measurements - self.x0
+        step = self.interval * self.integral_gain @ error
+        return commands - (self.u0 - self.gain @ error - step)
+
+    def step(
+        self,
+        state: jax.Array,
+        measurements: jax.Array,
+        time: jax.Array,  # noqa: ARG002
+    ) -> tuple[jax.Array, jax.Array]:
+        """Next state, and commands; see `Controller.step`."""
+        error = measurements - self.x0
+        wanted = self.u0 - self.gain @ error
+        if self.integral_gain is None:
+            return state, within(wanted, *self.limits)
+        by = -self.interval * self.integral_gain @ error
+        low, high = self.limits
+        unlimited = wanted + state + by
+        waits = ((unlimited > high) & (by > 0)) | ((unlimited < low) & (by < 0))
+        state = jnp.where(waits, state, state + by)
+        return state, within(wanted + state, *self.limits)
+
+
+def regulator_gain(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, interval: float
+) -> Array:
+    """Gain K of the linear-quadratic regulator u = -K x, with u held over the interval.
+
+    Parameters
+    ----------
+    A, B
+        ẋ = A x + B u in continuous time, ``(state, state)`` and ``(state, control)``.
+    Q, R
+        Weights of Σ xᵀQ x + uᵀR u over the steps.
+    interval
+        Time between two steps in s.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(control, state)``.
+
+    Raises
+    ------
+    DfsmError
+        There is no such gain: a part that does not decay cannot be reached by the controls or is
+        not weighted.
+    """
+    A, B, Q, R = (np.asarray(a, dtype=float) for a in (A, B, Q, R))
+    none = np.zeros((1, len(A)))
+    Ad, Bd, *_ = cont2discrete((A, B, none, np.zeros((1, B.shape[1]))), interval)
+    try:
+        P = solve_discrete_are(Ad, Bd, Q, R)
+    except (LinAlgError, ValueError) as error:
+        raise DfsmError(
+            f"there is no linear-quadratic regulator ({error}): weight every state that does not "
+            "decay by itself, and leave out those that the controls do not reach"
+        ) from None
+    return np.linalg.solve(R + Bd.T @ P @ Bd, Bd.T @ P @ Ad)

@@ -1,0 +1,263 @@
+"""Many controllers on many runs: what each would do to energy, loads and travel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from dfsm.controllers.controller import Controller
+from dfsm.core.files import json_value
+from dfsm.core.settings import require, settings_class
+from dfsm.core.units import POWERS, plain
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError, hushed, missing
+from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
+from dfsm.models.dfsm import DFSM
+from dfsm.models.signals import with_computed
+from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loops
+from dfsm.simulation.loop_cases import ClosedLoopSettings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# The record's own line among those of controllers.
+RECORDED = "recorded"
+
+
+@settings_class
+class SweepSettings:
+    """What a sweep is about.
+
+    Attributes
+    ----------
+    start, stop
+        Time window in s that is scored.
+    loop
+        How loops are closed.
+    power
+        Output that is the electrical power, for the annual energy; None for none.
+    speed, rated_speed
+        State or output, and the value in its unit over which its maximum is the overshoot.
+    """
+
+    start: float | None = None
+    stop: float | None = None
+    loop: ClosedLoopSettings = ClosedLoopSettings()
+    power: str | None = None
+    speed: str | None = None
+    rated_speed: float | None = None
+
+    def __post_init__(self) -> None:
+        both = (self.speed is None) == (self.rated_speed is None)
+        require(both, "rated_speed", self.rated_speed, "a value where speed is set, else none")
+
+
+@dataclass(frozen=True)
+class Swept:
+    """One controller over all runs.
+
+    Attributes
+    ----------
+    name
+        Of the controller.
+    runs
+        Figures by channel of every run; None for a loop that ended early.
+    endings
+        One sentence per loop that ended early.
+    figures
+        Of all runs with their weights, by channel; empty if one ended early: what is left out
+        would flatter it.
+    energy
+        Annual energy in MWh, of the share of the time that the weights stand for.
+    overshoot
+        Largest speed over the rated one, less 1.
+    """
+
+    name: str
+    runs: tuple[Mapping[str, Figures] | None, ...]
+    endings: tuple[str, ...]
+    figures: Mapping[str, Figures]
+    energy: float | None
+    overshoot: float | None
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Result of `sweep`.
+
+    Attributes
+    ----------
+    controllers
+        In the caller's order.
+    recorded
+        The same figures of the records, of channels that all of them hold.
+    runs, weights
+        Names of the runs and what each stands for.
+    units
+        By channel.
+    """
+
+    controllers: tuple[Swept, ...]
+    recorded: Swept
+    runs: tuple[str, ...]
+    weights: tuple[float, ...]
+    units: Mapping[str, str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values: all figures."""
+        values = {
+            "format": 1,
+            "runs": [
+                {"name": n, "weight": w} for n, w in zip(self.runs, self.weights, strict=True)
+            ],
+            "units": dict(self.units),
+            "controllers": [asdict(c) for c in self.controllers],
+            "recorded": asdict(self.recorded),
+        }
+        return dict(json_value(values))
+
+    def table(self, exponent: float = 4.0) -> pd.DataFrame:
+        """One line per controller, and the record's: mean, std, travel and DEL of every channel.
+
+        Parameters
+        ----------
+        exponent
+            Wöhler exponent of the damage-equivalent loads.
+        """
+        import pandas as pd
+
+        lines = {}
+        for swept in (self.recorded, *self.controllers):
+            line: dict[str, float | None] = {
+                "AEP (MWh)": swept.energy,
+                "overshoot": swept.overshoot,
+            }
+            for name, f in swept.figures.items():
+                line |= {f"{name} mean": f.mean, f"{name} std": f.std, f"{name} max": f.maximum}
+                line |= {f"{name} travel": f.travel, f"{name} DEL": f.damage[f"{exponent:g}"]}
+            lines[swept.name] = line
+        return pd.DataFrame.from_dict(lines, orient="index").dropna(axis=1, how="all")
+
+
+def sweep(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    controllers: Mapping[str, Controller],
+    *,
+    weights: Sequence[float] | None = None,
+    measurements: Mapping[str, str] | None = None,
+    settings: SweepSettings | None = None,
+) -> Sweep:
+    """Close the loop with every controller over every run.
+
+    Controllers that differ in numbers only, a `ROSCO` with other gains say, go through one
+    compilation, several at once.
+
+    Parameters
+    ----------
+    model, runs, measurements
+        As for `closed_loop`.
+    controllers
+        By the name under which each is shown.
+    weights
+        Share of the time that each run stands for, see `weibull_weights`; equal by default.
+    settings
+        Time window, and which signals are power and speed.
+
+    Returns
+    -------
+    Sweep
+
+    Raises
+    ------
+    DfsmError
+        As `closed_loop`; or weights that are not one positive number per run, no controllers, or a
+        power or speed that the model does not have.
+    """
+    settings = settings or SweepSettings()
+    if not controllers:
+        raise DfsmError("no controllers were given to sweep over, at least one is needed")
+    weights = [1 / len(runs)] * len(runs) if weights is None else [float(w) for w in weights]
+    require(len(weights) == len(runs), "weights", weights, f"one per run, {len(runs)}")
+    require(min(weights) > 0, "weights", weights, "numbers above 0")
+    s = model.signals
+    units = {c.name: c.unit for c in (*s.states, *s.controls, *s.outputs)}
+    named = [n for n in (settings.power, settings.speed) if n is not None]
+    if lost := [n for n in named if n not in units]:
+        raise DfsmError(f"settings: the model has {missing(lost, units)}")
+    runs = [with_computed(run, s.hub_height, s.features) for run in runs]
+    with hushed():
+        rolled = closed_loops(
+            model,
+            runs,
+            list(controllers.values()),
+            window=(settings.start, settings.stop),
+            measurements=measurements,
+            settings=settings.loop,
+        )
+    loops = dict(zip(controllers, rolled, strict=True))
+    swept = tuple(_swept(n, loops[n], weights, settings, units) for n in controllers)
+    recorded = _recorded(runs, rolled, weights, settings, units)
+    return Sweep(swept, recorded, tuple(r.name for r in runs), tuple(weights), units)
+
+
+def _swept(
+    name: str,
+    loops: Sequence[ClosedLoopRun],
+    weights: Sequence[float],
+    settings: SweepSettings,
+    units: Mapping[str, str],
+) -> Swept:
+    done = [r.status is LoopStatus.COMPLETED for r in loops]
+    figures = tuple(
+        case_figures(r.trajectory) if ok else None for r, ok in zip(loops, done, strict=True)
+    )
+    endings = tuple(
+        f"{r.trajectory.name}: {r.message}" for r, ok in zip(loops, done, strict=True) if not ok
+    )
+    return _over_all(name, figures, endings, weights, settings, units)
+
+
+def _recorded(
+    runs: Sequence[Trajectory],
+    rolled: Sequence[Sequence[ClosedLoopRun]],
+    weights: Sequence[float],
+    settings: SweepSettings,
+    units: Mapping[str, str],
+) -> Swept:
+    """The record over the time that is scored."""
+    names = [n for n in units if all(n in run for run in runs)]
+    figures = []
+    for i, run in enumerate(runs):
+        done = [r[i].trajectory for r in rolled if r[i].status is LoopStatus.COMPLETED]
+        ends = (float(done[0].time[0]), float(done[0].time[-1])) if done else (None, None)
+        figures.append(case_figures(run.window(*ends).select(names)))
+    return _over_all(RECORDED, tuple(figures), (), weights, settings, units)
+
+
+def _over_all(
+    name: str,
+    runs: tuple[Mapping[str, Figures] | None, ...],
+    endings: tuple[str, ...],
+    weights: Sequence[float],
+    settings: SweepSettings,
+    units: Mapping[str, str],
+) -> Swept:
+    whole = [run for run in runs if run is not None]
+    figures: dict[str, Figures] = {}
+    if len(whole) == len(runs):
+        figures = {n: Figures.over([run[n] for run in whole], weights) for n in whole[0]}
+    energy = overshoot = None
+    if settings.power in figures:
+        kilowatts = POWERS.get(plain(units[settings.power]))
+        if kilowatts is None:
+            raise DfsmError(
+                f"power: '{settings.power}' is in '{units[settings.power]}', expected one of "
+                f"{', '.join(POWERS)}"
+            )
+        mean = figures[settings.power].mean * kilowatts
+        energy = mean * sum(weights) * HOURS_PER_YEAR / 1e3
+    if settings.speed in figures and settings.rated_speed is not None:
+        overshoot = figures[settings.speed].maximum / settings.rated_speed - 1
+    return Swept(name, runs, endings, figures, energy, overshoot)

@@ -1,0 +1,153 @@
+"""Closed loops, told: tables and figures for terminal and page."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table
+from dfsm.validation.closed_loop import (
+    SHOWN_EXPONENT,
+    ClosedLoopComparison,
+    ClosedLoopValidation,
+)
+
+_RECORDED, _LOOP, _REPLAY = "recorded", "closed loop", "open-loop replay"
+# Points of a drawn series at most, and the highest frequency of a drawn spectrum in Hz.
+_POINTS = 3000
+_HIGHEST = 0.6
+
+
+def closed_loop_article(validation: ClosedLoopValidation, model: str, controller: str) -> Article:
+    """What a page and the terminal show.
+
+    Parameters
+    ----------
+    validation
+        Closed loops against records.
+    model, controller
+        Names to show.
+    """
+    done = f"{validation.completed} of {len(validation.runs)} closed loops came to their end."
+    sections = [
+        Section(
+            "figures",
+            "Closed loop against the record",
+            (done, *validation.endings()),
+            (_over_runs(validation), _by_run(validation)),
+        )
+    ]
+    for run in validation.runs:
+        if run.loop_statistics:
+            sections.append(_drawn(run, validation.channels))
+    lede = (
+        f"{controller} on {model}, driven by disturbances only from the recorded state at the "
+        "start, beside the rollout along the recorded controls."
+    )
+    return Article("closed_loop", "Closed loop", lede, tuple(sections))
+
+
+def _over_runs(validation: ClosedLoopValidation) -> Table:
+    rows = []
+    for channel in validation.channels:
+        row = validation.row(channel.name)
+        if row is not None:
+            rows.append(
+                (
+                    channel.label,
+                    row.recorded_mean,
+                    row.mean,
+                    row.std_ratio,
+                    row.std_worst,
+                    row.replay_std_ratio,
+                    row.damage_ratio,
+                    row.damage_worst,
+                    row.replay_damage_ratio,
+                    row.nrmse,
+                    row.replay_nrmse,
+                )
+            )
+    return Table(
+        "over_runs",
+        "All runs: simulated over recorded",
+        (
+            *("channel", "mean, recorded", "closed loop"),
+            *("std", "worst", "replay"),
+            *("DEL", "worst", "replay"),
+            *("NRMSE", "replay"),
+        ),
+        tuple(rows),
+        note=(
+            "std, DEL: ratio to the record, mean of the runs, that of the run farthest from 1, and "
+            f"of the open-loop replay; DEL with m = {SHOWN_EXPONENT}; NRMSE at equal times"
+        ),
+    )
+
+
+def _by_run(validation: ClosedLoopValidation) -> Table:
+    rows = []
+    for run in validation.runs:
+        for channel in validation.channels:
+            if channel.name not in run.loop_statistics:
+                continue
+            true, ours = run.statistics[channel.name], run.loop_statistics[channel.name]
+            replay = run.replay_statistics.get(channel.name)
+            damages = [
+                None if s is None else s.damage.get(SHOWN_EXPONENT) for s in (true, ours, replay)
+            ]
+            rows.append(
+                (
+                    run.recorded.name,
+                    channel.label,
+                    *(true.mean, ours.mean, None if replay is None else replay.mean),
+                    *(true.std, ours.std, None if replay is None else replay.std),
+                    *damages,
+                    run.loop_errors[channel.name].nrmse,
+                )
+            )
+    return Table(
+        "by_run",
+        "Each run: recorded, closed loop, open-loop replay",
+        (
+            *("run", "channel"),
+            *("mean, recorded", "mean, loop", "mean, replay"),
+            *("std, recorded", "std, loop", "std, replay"),
+            *("DEL, recorded", "DEL, loop", "DEL, replay"),
+            "NRMSE",
+        ),
+        tuple(rows),
+    )
+
+
+def _drawn(run: ClosedLoopComparison, channels: tuple[Channel, ...]) -> Section:
+    name = run.recorded.name
+    parts = [(_RECORDED, run.recorded, 0), (_LOOP, run.loop.trajectory, 1)]
+    if run.replay_statistics:
+        parts.append((_REPLAY, run.replay.trajectory, 2))
+    statistics = (run.statistics, run.loop_statistics, run.replay_statistics)
+    series, spectra = [], []
+    for channel in channels:
+        curves = [_series(n, t, channel.name, k) for n, t, k in parts if channel.name in t]
+        series.append(Panel(channel.name, "time (s)", channel.label, tuple(curves)))
+        lines = []
+        for (label, _, colour), found in zip(parts, statistics, strict=False):
+            if channel.name in found:
+                spectrum = found[channel.name].spectrum
+                kept = (spectrum.frequency > 0) & (spectrum.frequency <= _HIGHEST)
+                x, y = spectrum.frequency[kept], spectrum.density[kept]
+                lines.append(Curve(label, x, np.maximum(y, np.finfo(float).tiny), colour))
+        spectra.append(Panel(channel.name, "frequency (Hz)", "PSD", tuple(lines), log="y"))
+    return Section(
+        f"run-{name}",
+        name,
+        (run.loop.message,),
+        figures=(
+            Figure(f"series-{name}", f"{name}: time series", tuple(series), stacked=True),
+            Figure(f"spectra-{name}", f"{name}: power spectral densities", tuple(spectra)),
+        ),
+    )
+
+
+def _series(label: str, run: Trajectory, channel: str, colour: int) -> Curve:
+    every = max(1, len(run) // _POINTS)
+    return Curve(label, run.time[::every], run[channel][::every], colour)

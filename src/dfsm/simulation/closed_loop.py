@@ -1,0 +1,388 @@
+"""A controller on a model: closed loops along recorded runs, driven by wind and waves only.
+
+The run gives disturbances, the state at the start, and controls that the controller does not set.
+From the start on nothing else of the record enters: what follows is the model's and the
+controller's own.
+"""
+
+from __future__ import annotations
+
+import enum
+import os
+import time as clock
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.controllers.controller import Controller
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.errors import DfsmWarning, printable
+from dfsm.models.dfsm import DFSM
+from dfsm.simulation.loop import HostLoop, Path, roll_compiled, roll_many
+from dfsm.simulation.loop_cases import ClosedLoopSettings, LoopCase, padded, prepared_cases
+from dfsm.simulation.simulate import ESCAPE, MUCH_OUTSIDE
+from dfsm.simulation.wires import Wires, connect, not_commanded
+
+# Calls are padded to a multiple of this, so that runs of similar length share a compilation.
+_PAD = 400
+# Controllers that go through one loop side by side.
+_ABREAST = 8
+
+
+class LoopStatus(enum.Enum):
+    """How a closed loop ended; the value says what it means and what to do."""
+
+    COMPLETED = "completed"
+    UNSTABLE = (
+        "the loop is unstable: a state left the training range by a factor of ten; take smaller "
+        "gains or a shorter interval, and see with dfsm validate whether the model is good there"
+    )
+    CONTROLLER_FAILED = "the controller set no number: look at its gains, filters and tables"
+
+
+@dataclass(frozen=True)
+class ClosedLoopRun:
+    """A closed loop along one run.
+
+    Attributes
+    ----------
+    trajectory
+        States, controls and outputs on the run's time mesh from the end of the start-up to where
+        the loop ended; roles are set. All of the loop, if it ended before.
+    status
+        How it ended.
+    ended
+        Last time in s.
+    reason
+        For a loop that did not complete, the signal and where; else "".
+    outside
+        Share of the samples with any input of the model outside its training range.
+    wall_time
+        Seconds it took (of the whole batch divided by its runs), without compilation when warm.
+    """
+
+    trajectory: Trajectory
+    status: LoopStatus
+    ended: float
+    reason: str
+    outside: float
+    wall_time: float = 0.0
+
+    def __repr__(self) -> str:
+        run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
+        return (
+            f"<ClosedLoopRun of {printable(run.name)}: {outcome}, {run.time[0]:g} to "
+            f"{self.ended:g} s, {len(run)} samples; {printable(self.message)}>"
+        )
+
+    @property
+    def message(self) -> str:
+        """One sentence on the outcome."""
+        if self.status is LoopStatus.COMPLETED:
+            return f"{self.outside:.1%} of the time outside the training range"
+        return f"{self.reason}; {self.status.value}"
+
+
+@overload
+def closed_loop(
+    model: DFSM,
+    runs: Trajectory,
+    controller: Controller,
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    measurements: Mapping[str, str] | None = None,
+    settings: ClosedLoopSettings | None = None,
+) -> ClosedLoopRun: ...
+@overload
+def closed_loop(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    controller: Controller,
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    measurements: Mapping[str, str] | None = None,
+    settings: ClosedLoopSettings | None = None,
+) -> list[ClosedLoopRun]: ...
+def closed_loop(
+    model: DFSM,
+    runs: Trajectory | Sequence[Trajectory],
+    controller: Controller,
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    measurements: Mapping[str, str] | None = None,
+    settings: ClosedLoopSettings | None = None,
+) -> ClosedLoopRun | list[ClosedLoopRun]:
+    """Close the loop between a model and a controller along one run, or many.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    runs
+        Trajectories that hold the model's controls, disturbances and parameters, and its measured
+        states. After the loop has begun only disturbances and parameters are read, and controls
+        that the controller does not set.
+    controller
+        Steps at its interval and holds its commands in between. An equinox module is compiled with
+        the plant; any other `Controller`, a `BladedLibrary` say, is called on the host.
+    start, stop
+        Time window in s that is scored; None leaves that end open.
+    measurements
+        Signal of the model by measurement of the controller, where names differ:
+        ``{"NcIMURAys": "PtfmPitch_dot_dot"}`` takes the derivative of the state PtfmPitch_dot.
+    settings
+        Start-up and plant steps.
+
+    Returns
+    -------
+    ClosedLoopRun or list of ClosedLoopRun
+        In the order of `runs`.
+
+    Raises
+    ------
+    DfsmError
+        The model lacks what the controller reads or sets, a channel is missing or not finite, a
+        run is not longer than the start-up, or a library refuses.
+
+    Warns
+    -----
+    DfsmWarning
+        A control stays as recorded, a loop ended early, or was outside the training range for part
+        of the time.
+    """
+    batch = [runs] if isinstance(runs, Trajectory) else list(runs)
+    if kept := not_commanded(model, controller):
+        warnings.warn(
+            f"the controller does not set {', '.join(kept)}: recorded values are taken",
+            DfsmWarning,
+            stacklevel=2,
+        )
+    (results,) = closed_loops(
+        model,
+        batch,
+        [controller],
+        window=(start, stop),
+        measurements=measurements,
+        settings=settings,
+    )
+    _warn(results)
+    return results[0] if isinstance(runs, Trajectory) else results
+
+
+def closed_loops(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    controllers: Sequence[Controller],
+    *,
+    window: tuple[float | None, float | None] = (None, None),
+    measurements: Mapping[str, str] | None = None,
+    settings: ClosedLoopSettings | None = None,
+) -> list[list[ClosedLoopRun]]:
+    """Close the loop with each of several controllers over each of several runs.
+
+    Compiled controllers that differ in numbers only run side by side.
+
+    Parameters
+    ----------
+    model, runs, measurements, settings
+        As for `closed_loop`.
+    controllers
+        Any number.
+    window
+        Start and stop of what is scored in s.
+
+    Returns
+    -------
+    list of list of ClosedLoopRun
+        Per controller, in the order of `runs`.
+
+    Raises
+    ------
+    DfsmError
+        As `closed_loop`.
+    """
+    settings = settings or ClosedLoopSettings()
+    wires = [connect(model, controller, measurements) for controller in controllers]
+    intervals = {float(c.interval) for c in controllers}
+    cases = {i: prepared_cases(model, runs, i, window, settings) for i in intervals}
+    begin = clock.perf_counter()
+    tasks = list[tuple[list[int], int, Callable[[], list[Path]]]]()
+    for members in _alike(controllers):
+        law, wired = [controllers[i] for i in members], wires[members[0]]
+        rolled = _roller(model, wired, law)
+        for run, case in enumerate(cases[float(law[0].interval)]):
+            tasks.append((members, run, partial(rolled, case)))
+    results: dict[tuple[int, int], ClosedLoopRun] = {}
+    # XLA keeps a loop on one core; libraries wait in processes of their own.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        rolls = pool.map(lambda task: task[2](), tasks)
+        for (members, run, _), paths in zip(tasks, rolls, strict=True):
+            for i, path in zip(members, paths, strict=True):
+                case = cases[float(controllers[i].interval)][run]
+                results[i, run] = result_of(model, wires[i], controllers[i], case, path)
+    wall = (clock.perf_counter() - begin) / max(1, len(results))
+    return [
+        [replace(results[i, run], wall_time=wall) for run in range(len(runs))]
+        for i in range(len(controllers))
+    ]
+
+
+def _roller(
+    model: DFSM, wires: Wires, controllers: Sequence[Controller]
+) -> Callable[[LoopCase], list[Path]]:
+    """What closes the loop over one case with controllers that are alike."""
+    if not is_compiled(controllers[0]):
+        host, low, high = HostLoop(model, wires), *_bounds(model)
+
+        def gone(x: Array) -> bool:
+            return not bool(((x >= low) & (x <= high)).all())
+
+        def called(case: LoopCase) -> list[Path]:
+            drive = padded(case, len(case.drive.time) + 1)
+            return [host.roll(c, drive, gone) for c in controllers]
+
+        return called
+
+    def compiled(case: LoopCase) -> list[Path]:
+        calls = -(-(len(case.drive.time) + 1) // _PAD) * _PAD
+        drive = padded(case, calls)
+        if len(controllers) == 1:
+            return [roll_compiled(model, wires, controllers[0], drive)]
+        stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *map(_numbers, controllers))
+        paths = jax.tree.map(np.asarray, roll_many(model, wires, stacked, drive))
+        return [jax.tree.map(lambda part, i=i: part[i], paths) for i in range(len(controllers))]
+
+    return compiled
+
+
+def is_compiled(controller: Any) -> bool:
+    """Whether JAX can follow a controller: an equinox module, and what it wraps likewise."""
+    inner = getattr(controller, "inner", None)
+    return isinstance(controller, eqx.Module) and (inner is None or is_compiled(inner))
+
+
+def _numbers(controller: Any) -> Any:
+    """The controller with all its numbers as arrays."""
+    return jax.tree.map(jnp.asarray, controller)
+
+
+def _alike(controllers: Sequence[Controller]) -> list[list[int]]:
+    """Which controllers go through one loop side by side: compiled, of one structure."""
+    groups: list[list[int]] = []
+    structures: dict[Any, list[int]] = {}
+    for i, controller in enumerate(controllers):
+        if not is_compiled(controller):
+            groups.append([i])
+            continue
+        leaves, structure = jax.tree.flatten(_numbers(controller))
+        key = (structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+        members = structures.setdefault(key, [])
+        if not members or len(members) == _ABREAST:
+            structures[key] = members = []
+            groups.append(members)
+        members.append(i)
+    return groups
+
+
+# -- judging the outcome ------------------------------------------------------------------------
+
+
+def _bounds(model: DFSM) -> tuple[Array, Array]:
+    """Lowest and highest states before a loop counts as unstable."""
+    columns = model.signals.state_columns
+    low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
+    middle, half = (low + high) / 2, (high - low) / 2
+    return middle - ESCAPE * half, middle + ESCAPE * half
+
+
+def result_of(
+    model: DFSM, wires: Wires, controller: Controller, case: LoopCase, path: Path
+) -> ClosedLoopRun:
+    """Judge how a closed loop ended, and sample it as the run."""
+    s, steps = model.signals, case.rows
+    states, controls, outputs = (
+        np.asarray(a)[:steps] for a in (path.states, path.controls, path.outputs)
+    )
+    time = float(case.drive.time[0]) + float(case.drive.h[0]) * np.arange(steps)
+    low, high = _bounds(model)
+    escaped = ~((states >= low) & (states <= high))
+    status, reason, end = LoopStatus.COMPLETED, "", steps
+    if rows := np.flatnonzero(escaped.any(axis=1)).tolist():
+        end = rows[0]
+        column = int(np.flatnonzero(escaped[end])[0])
+        state, value = s.states[column], states[end, column]
+        status = LoopStatus.UNSTABLE
+        reason = f"{state.name} reached {value:.4g} {state.unit} at {time[end]:g} s"
+    commanded = controls[:, list(wires.commanded)]
+    failed = np.flatnonzero(~np.isfinite(commanded[:end]).all(axis=1))
+    if len(failed):
+        end = int(failed[0])
+        status = LoopStatus.CONTROLLER_FAILED
+        reason = _failure(controller, path, commanded[end], (end // case.per_call, time[end]))
+    channels = tuple(
+        replace(c, role=role)
+        for group, role in (("states", "state"), ("controls", "control"), ("outputs", "output"))
+        for c in getattr(s, group)
+    )
+    values = case.sampled(np.concatenate([states, controls, outputs], axis=1))
+    outside = case.sampled(np.asarray(path.outside)[:steps, None].astype(float))[:, 0]
+    return _cut(case, (values, outside), channels, (status, reason, time[min(end, steps - 1)]))
+
+
+def _failure(controller: Controller, path: Path, commanded: Array, at: tuple[int, float]) -> str:
+    """Which command is no number, and whether a measurement was one."""
+    call, time = at
+    seen = np.asarray(path.measurements)[call]
+    if not np.isfinite(seen).all():
+        name = controller.measurements[int(np.flatnonzero(~np.isfinite(seen))[0])]
+        return f"the measurement {name} is {seen[~np.isfinite(seen)][0]} at {time:g} s"
+    column = int(np.flatnonzero(~np.isfinite(commanded))[0])
+    return f"{controller.commands[column]} is {commanded[column]} at {time:g} s"
+
+
+def _cut(
+    case: LoopCase,
+    sampled: tuple[Array, Array],
+    channels: Sequence[Channel],
+    ending: tuple[LoopStatus, str, float],
+) -> ClosedLoopRun:
+    """The result up to where the loop ended, without the start-up where something is left."""
+    (values, outside), (status, reason, ended), run = sampled, ending, case.run
+    rows = len(run)
+    if status is not LoopStatus.COMPLETED:
+        rows = int(np.searchsorted(run.time, ended, side="right"))
+    first = case.scored if rows >= case.scored + 2 else 0
+    kept = slice(first, max(rows, first + 2))
+    part = Trajectory(
+        run.time[kept], values[kept], tuple(channels), name=run.name, source=run.source
+    )
+    return ClosedLoopRun(part, status, float(ended), reason, float(outside[kept].mean()))
+
+
+def _warn(results: Sequence[ClosedLoopRun]) -> None:
+    for r in results:
+        if r.status is not LoopStatus.COMPLETED:
+            warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=3)
+    done = [r for r in results if r.status is LoopStatus.COMPLETED]
+    outside = [r for r in done if r.outside > MUCH_OUTSIDE]
+    if outside:
+        worst = max(outside, key=lambda r: r.outside)
+        warnings.warn(
+            f"{len(outside)} of {len(results)} closed loops spend more than {MUCH_OUTSIDE:.0%} of "
+            f"the time outside the training range, {worst.trajectory.name} most "
+            f"({worst.outside:.1%})",
+            DfsmWarning,
+            stacklevel=3,
+        )

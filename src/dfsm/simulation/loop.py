@@ -1,0 +1,287 @@
+"""The closed loop as a pure function: a controller steps, the plant marches until it steps again.
+
+A controller that is an equinox module is compiled with the plant into one loop, which JAX can
+follow: gradients with respect to its gains, many controllers at once. Any other runs on the host,
+call by call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.controllers.controller import Controller
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError
+from dfsm.models.dfsm import DFSM
+from dfsm.numerics.runge_kutta import rk4_step
+from dfsm.simulation.integrate import observe, rate
+from dfsm.simulation.wires import Wires
+
+
+class Drive(NamedTuple):
+    """Where a closed loop starts and what drives it.
+
+    Attributes
+    ----------
+    x0, psi0
+        Initial states ``(state,)`` and azimuth in rad.
+    time
+        When the controller steps, in s, ``(call,)``.
+    h
+        Length of the plant's steps until the next call, in s, ``(call,)``; zero changes nothing.
+    inputs
+        Recorded controls, disturbances and parameters at ends and middles of all plant steps,
+        ``(2 step + 1, exogenous)``.
+    field
+        Harmonics of the wind field at the ends of all plant steps, ``(step + 1, channel)``.
+    """
+
+    x0: jax.Array
+    psi0: jax.Array
+    time: jax.Array
+    h: jax.Array
+    inputs: jax.Array
+    field: jax.Array
+
+
+class Path(NamedTuple):
+    """What a closed loop gives at the ends of all plant steps.
+
+    Attributes
+    ----------
+    states, controls, outputs
+        Shapes ``(step + 1, n)``, in the model's units; controls as they are from then on.
+    outside
+        Whether any input of the model is outside its training range, ``(step + 1,)``.
+    measurements
+        What the controller read at its calls, in its units, ``(call, measurement)``.
+    """
+
+    states: jax.Array
+    controls: jax.Array
+    outputs: jax.Array
+    outside: jax.Array
+    measurements: jax.Array
+
+
+def roll(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
+    """Close the loop over one run; JAX can follow it.
+
+    Parameters
+    ----------
+    model
+        The surrogate, best `prepared`.
+    wires
+        How the controller is connected.
+    controller
+        A `Controller` that JAX can follow.
+    drive
+        Start and inputs.
+
+    Returns
+    -------
+    Path
+        In which the first call of the controller comes at the first time.
+    """
+    calls = len(drive.time)
+    steps = (len(drive.inputs) - 1) // 2
+    per_call = steps // calls
+
+    def by_call(values: jax.Array) -> jax.Array:
+        return values.reshape(calls, per_call, -1)
+
+    v = drive.inputs
+    legs = tuple(by_call(part) for part in (v[:-2:2], v[1::2], v[2::2]))
+    fields = drive.field[:-1:per_call]
+    seen = wires.measured(model, drive.x0, v[0], (drive.psi0, drive.field[0]))
+    begun = _plain(controller.start(seen, wires.commands_of(v[0])))
+    first = v[0, jnp.array(wires.commanded)]
+    carry = (drive.x0, drive.psi0, first, begun)
+
+    @jax.checkpoint
+    def call(carry: Any, drive: Any) -> tuple[Any, Any]:
+        x, psi, held, state = carry
+        time, h, legs, field = drive
+        seen = wires.measured(model, x, wires.with_commands(legs[0][0], held), (psi, field))
+        new, commands = controller.step(state, seen, time)
+        state, commands = _like(new, state), wires.in_model_units(_checked(commands, wires))
+        path = []
+        for leg in range(per_call):
+            path.append(x)
+            ends = tuple(wires.with_commands(part[leg], commands) for part in legs)
+            x, psi = _plant_step(model, x, psi, h, ends)
+        return (x, psi, commands, state), (jnp.stack(path), commands, seen)
+
+    (last, *_), (xs, commands, seen) = jax.lax.scan(
+        call, carry, (drive.time, drive.h, legs, fields)
+    )
+    states = jnp.concatenate([xs.reshape(steps, -1), last[None]])
+    commands = jnp.repeat(commands, per_call, axis=0)
+    inputs = wires.with_commands(v[::2], jnp.concatenate([commands, commands[-1:]]))
+    h = jnp.repeat(drive.h, per_call)
+    outputs, outside = observe(model, h, states, (inputs, drive.field), drive.psi0)
+    return Path(states, inputs[:, : len(model.signals.controls)], outputs, outside, seen)
+
+
+def _plant_step(
+    model: DFSM, x: jax.Array, psi: jax.Array, h: jax.Array, ends: tuple[jax.Array, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """States and azimuth one step on."""
+    new, _ = rk4_step(partial(rate, model), x, h, ends)  # pyright: ignore[reportArgumentType]
+    turn = model.signals.azimuth_rate
+    if turn is not None:
+        psi = psi + 0.5 * h * turn[1] * (x[turn[0]] + new[turn[0]])
+    return new, psi
+
+
+def _plain(state: Any) -> Any:
+    """A state whose numbers are arrays; a Python number may become a fraction later."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, dtype=float) if isinstance(leaf, int | float) else leaf,
+        state,
+    )
+
+
+def _like(new: Any, old: Any) -> Any:
+    """The next state as the loop carries it.
+
+    Raises
+    ------
+    DfsmError
+        It is made of other parts than the state before.
+    """
+    same = jax.tree.structure(new) == jax.tree.structure(old)
+    shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(state)] for state in (old, new)]
+    if not same or shapes[0] != shapes[1]:
+        raise DfsmError(
+            f"the controller's step turns a state of shapes {shapes[0]} into one of {shapes[1]}: "
+            "start and step must return states of the same parts"
+        )
+    return jax.tree.map(
+        lambda a, b: jnp.asarray(a, dtype=b.dtype) if hasattr(b, "dtype") else b, new, old
+    )
+
+
+def _checked(commands: Any, wires: Wires) -> jax.Array:
+    commands = jnp.asarray(commands, dtype=float)
+    if commands.shape != (len(wires.commanded),):
+        raise DfsmError(
+            f"the controller's step returns commands of shape {commands.shape}, expected "
+            f"({len(wires.commanded)},): one number per command"
+        )
+    return commands
+
+
+@eqx.filter_jit
+def roll_compiled(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
+    """`roll`, compiled; models, controllers and runs of the same shapes share one compilation."""
+    return roll(model.prepared(), wires, controller, drive)
+
+
+@eqx.filter_jit
+def roll_many(model: DFSM, wires: Wires, controllers: Any, drive: Drive) -> Path:
+    """`roll` with several controllers side by side, whose numbers have a leading axis."""
+    model = model.prepared()
+    return jax.vmap(lambda controller: roll(model, wires, controller, drive))(controllers)
+
+
+# -- on the host --------------------------------------------------------------------------------
+
+
+class HostLoop:
+    """Closed loops with a controller that JAX cannot follow: compiled plant, controller in between.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    wires
+        How the controller is connected.
+    """
+
+    def __init__(self, model: DFSM, wires: Wires) -> None:
+        self.model, self.wires = model, wires
+        arrays, rest = eqx.partition(model.prepared(), eqx.is_array)
+
+        # Not `filter_jit`, whose own work would be most of a call's time.
+        @jax.jit
+        def seen(arrays: Any, x: Array, v: Array, blades: Any) -> jax.Array:
+            return wires.measured(eqx.combine(arrays, rest), x, jnp.asarray(v), blades)
+
+        @jax.jit
+        def on(arrays: Any, x: Array, psi: Array, h: Array, legs: Any) -> Any:
+            model, v, commands, field = eqx.combine(arrays, rest), *legs
+            driven = wires.with_commands(jnp.asarray(v), wires.in_model_units(commands))
+            path = []
+            for leg in range((len(v) - 1) // 2):
+                x, psi = _plant_step(model, x, psi, h, tuple(driven[2 * leg + i] for i in range(3)))
+                path.append(x)
+            now = wires.measured(model, x, driven[-1], (psi, field))
+            return jnp.stack(path), psi, now
+
+        self._seen = partial(seen, arrays)
+        self._on = partial(on, arrays)
+        self._observed = eqx.filter_jit(observe)
+
+    def roll(self, controller: Controller, drive: Drive, stop: Callable[[Array], bool]) -> Path:
+        """Close the loop over one run until it ends, or `stop` says so of the states.
+
+        Parameters
+        ----------
+        controller
+            Steps on the host.
+        drive
+            Start and inputs.
+        stop
+            Tells of states ``(state,)`` whether to go no further.
+
+        Returns
+        -------
+        Path
+            Not a number from where the loop was stopped.
+        """
+        wires, drive = self.wires, jax.tree.map(np.asarray, drive)
+        v, field = drive.inputs, drive.field
+        calls, steps = len(drive.time), (len(v) - 1) // 2
+        per_call = steps // calls
+        states = np.full((steps + 1, len(drive.x0)), np.nan)
+        commands = np.full((steps + 1, len(wires.commanded)), np.nan)
+        read = np.full((calls, len(wires.sources)), np.nan)
+        states[0], psi = drive.x0, drive.psi0
+        seen = np.asarray(self._seen(states[0], v[0], (psi, field[0])))
+        state = controller.start(seen, np.asarray(wires.commands_of(jnp.asarray(v[0]))))
+        try:
+            for k, (time, h) in enumerate(zip(drive.time, drive.h, strict=True)):
+                row = k * per_call
+                read[k] = seen
+                if stop(states[row]):
+                    break
+                state, told = controller.step(state, seen, time)
+                rows = slice(row, row + per_call)
+                commands[rows] = told = np.asarray(told, dtype=float)
+                if not np.isfinite(told).all():
+                    break
+                until = row + per_call
+                legs = (v[2 * row : 2 * until + 1], told, field[until])
+                path, psi, seen = self._on(states[row], psi, h, legs)
+                states[row + 1 : until + 1], seen = path, np.asarray(seen)
+        finally:
+            close = getattr(state, "close", None)
+            if close is not None:
+                close()
+        inputs = wires.with_commands(
+            jnp.asarray(v[::2]), wires.in_model_units(jnp.asarray(commands))
+        )
+        h = jnp.repeat(jnp.asarray(drive.h), per_call)
+        outputs, outside = self._observed(
+            self.model, h, jnp.asarray(states), (inputs, drive.field), jnp.asarray(drive.psi0)
+        )
+        count = len(self.model.signals.controls)
+        return Path(states, inputs[:, :count], outputs, outside, read)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,178 @@
+"""Runs prepared for closed loops: when the controller steps, and what drives the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.settings import require, settings_class
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+from dfsm.models.completion import all_completed
+from dfsm.models.dfsm import DFSM
+from dfsm.models.signals import require_constant, require_field
+from dfsm.simulation.loop import Drive
+from dfsm.simulation.simulate import initial_azimuth, initial_state
+
+# Ratios of intervals with denominators up to this are met exactly.
+_MOST_PARTS = 20
+
+
+@settings_class
+class ClosedLoopSettings:
+    """How a loop is closed.
+
+    Attributes
+    ----------
+    start_up
+        Seconds before the time window in which the loop already runs, so that what is scored holds
+        nothing of how filters and estimators begin. Where the record does not begin so early, the
+        window begins later.
+    step
+        Largest RK4 step of the plant in s; None takes the run's samples, or the controller's
+        interval where that is shorter.
+    """
+
+    start_up: float = 60.0
+    step: float | None = None
+
+    def __post_init__(self) -> None:
+        require(self.start_up >= 0, "start_up", self.start_up, "seconds, at least 0")
+        require(self.step is None or self.step > 0, "step", self.step, "seconds, more than 0")
+
+
+@dataclass(frozen=True)
+class LoopCase:
+    """A run prepared for the loop: its drive, and where its samples lie on the plant's steps.
+
+    Attributes
+    ----------
+    run
+        The samples from the loop's beginning on.
+    drive
+        With NumPy arrays, not padded.
+    per_call
+        Plant steps per call.
+    scored
+        First sample after the start-up.
+    """
+
+    run: Trajectory
+    drive: Drive
+    per_call: int
+    scored: int
+
+    @property
+    def rows(self) -> int:
+        """Ends of plant steps within the run."""
+        return (len(self.drive.inputs) + 1) // 2
+
+    def sampled(self, values: Array) -> Array:
+        """Rows at the run's samples of ``(step + 1, n)``."""
+        h = float(self.drive.h[0])
+        at = (self.run.time - self.run.time[0]) / h
+        rows = np.rint(at).astype(int)
+        if np.abs(at - rows).max() < 1e-4:
+            return values[rows]
+        mesh = np.arange(len(values))
+        return np.stack([np.interp(at, mesh, column) for column in values.T], axis=1)
+
+
+def prepared_cases(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    interval: float,
+    window: tuple[float | None, float | None],
+    settings: ClosedLoopSettings,
+) -> list[LoopCase]:
+    """Prepare runs for a controller that steps at an interval in s.
+
+    Raises
+    ------
+    DfsmError
+        No runs, a channel that is missing or not finite, or a run not longer than the start-up.
+    """
+    if not runs:
+        raise DfsmError("no runs were given to close the loop over")
+    s = model.signals
+    cases = []
+    for run in all_completed(list(runs), s):
+        run.columns((*s.exogenous, *s.measured))
+        require_field(run, s.azimuth)
+        cases.append(_case(model, run, interval, window, settings))
+    return cases
+
+
+def _case(
+    model: DFSM,
+    run: Trajectory,
+    interval: float,
+    window: tuple[float | None, float | None],
+    settings: ClosedLoopSettings,
+) -> LoopCase:
+    s, (start, stop) = model.signals, window
+    first = float(run.time[0]) if start is None else start - settings.start_up
+    part = run.window(first, stop)
+    begins, ends = float(part.time[0]), float(part.time[-1])
+    calls = int(np.floor((ends - begins) / interval * (1 + 1e-9)))
+    scored = begins + settings.start_up
+    after = np.flatnonzero(part.time >= scored - 1e-9 * part.duration)
+    if calls < 1 or len(after) < 2:
+        raise DfsmError(
+            f"{run.where}: lasts from {begins:g} to {ends:g} s, not longer than the start-up of "
+            f"{settings.start_up:g} s and an interval of {interval:g} s: take a longer run, or a "
+            "shorter start-up"
+        )
+    sampling = run.time_step or float(np.median(np.diff(run.time)))
+    per_call = _steps_per_call(interval, sampling, settings.step)
+    h = interval / per_call
+    driven = part.select(s.exogenous).require_finite()
+    require_constant(driven, s.names("parameters"))
+    mesh = begins + h / 2 * np.arange(2 * calls * per_call + 1)
+    fields = part.select(s.names("field")).require_finite()
+    drive = Drive(
+        x0=initial_state(model, run, begins),  # pyright: ignore[reportArgumentType]
+        psi0=initial_azimuth(model, run, begins),  # pyright: ignore[reportArgumentType]
+        time=begins + interval * np.arange(calls),  # pyright: ignore[reportArgumentType]
+        h=np.full(calls, h),  # pyright: ignore[reportArgumentType]
+        inputs=_interpolated(driven, mesh),  # pyright: ignore[reportArgumentType]
+        field=_interpolated(fields, mesh[::2]),  # pyright: ignore[reportArgumentType]
+    )
+    inside = part.time <= mesh[-1] + 1e-6 * h
+    part = replace(part, time=part.time[inside], values=part.values[inside])
+    return LoopCase(part, drive, per_call, int(after[0]))
+
+
+def _steps_per_call(interval: float, sampling: float, step: float | None) -> int:
+    """Plant steps per call, such that the run's samples lie on steps where that is possible."""
+    ratio = Fraction(sampling / interval).limit_denominator(_MOST_PARTS)
+    met = ratio > 0 and abs(float(ratio) * interval - sampling) < 1e-6 * sampling
+    parts = ratio.denominator if met else 1
+    longest = min(sampling, interval) if step is None else step
+    return parts * max(1, int(np.ceil(interval / parts / longest * (1 - 1e-9))))
+
+
+def _interpolated(run: Trajectory, mesh: Array) -> Array:
+    if not run.channels:
+        return np.zeros((len(mesh), 0))
+    return np.stack([np.interp(mesh, run.time, column) for column in run.values.T], axis=1)
+
+
+def padded(case: LoopCase, calls: int) -> Drive:
+    """The drive with further calls in which nothing moves, the first at the end of the run."""
+    d, more = case.drive, calls - len(case.drive.time)
+    interval = float(d.h[0]) * case.per_call
+    steps = more * case.per_call
+
+    def held(values: Array, rows: int) -> Array:
+        return np.concatenate([values, np.repeat(values[-1:], rows, axis=0)])
+
+    time = np.concatenate([d.time, d.time[-1] + interval * np.arange(1, more + 1)])
+    h = np.concatenate([d.h, np.zeros(more)])
+    inputs, field = held(np.asarray(d.inputs), 2 * steps), held(np.asarray(d.field), steps)
+    return Drive(*map(jnp.asarray, (d.x0, d.psi0, time, h, inputs, field)))

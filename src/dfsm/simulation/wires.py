@@ -1,0 +1,190 @@
+"""Which signals of a model a controller reads and sets, and in which units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from dfsm.controllers.controller import Controller
+from dfsm.core.units import agree, factor
+from dfsm.data.derivatives import per_second
+from dfsm.errors import DfsmError, near_matches
+from dfsm.models.dfsm import DFSM
+
+_RATE = "_dot"
+
+
+@dataclass(frozen=True)
+class Wires:
+    """How a controller is connected to a model.
+
+    Attributes
+    ----------
+    sources
+        Group and column of every measurement; group ``"rates"`` are derivatives of states.
+    factors
+        What one unit of the model is in the controller's unit, per measurement.
+    commanded
+        Column of the control that each command sets.
+    command_factors
+        What one unit of the controller is in the model's unit, per command.
+    """
+
+    sources: tuple[tuple[str, int], ...]
+    factors: tuple[float, ...]
+    commanded: tuple[int, ...]
+    command_factors: tuple[float, ...]
+
+    @property
+    def reads_outputs(self) -> bool:
+        """Whether a measurement is an output of the model."""
+        return any(group == "outputs" for group, _ in self.sources)
+
+    def measured(
+        self,
+        model: DFSM,
+        states: jax.Array,
+        exogenous: jax.Array,
+        blades: tuple[jax.Array, jax.Array],
+    ) -> jax.Array:
+        """Measurements in the controller's units, ``(measurement,)``.
+
+        Parameters
+        ----------
+        model
+            The surrogate.
+        states, exogenous
+            At this time, the controls as they were until now, ``(state,)`` and ``(exogenous,)``.
+        blades
+            Azimuth in rad, and harmonics of the wind field, ``(channel,)``.
+        """
+        u, w, p = model.signals.order.split_exogenous(exogenous)
+        groups = {"states": states, "controls": u, "disturbances": w, "parameters": p}
+        if any(group == "rates" for group, _ in self.sources):
+            groups["rates"] = model.derivative(states, u, w, p)
+        if self.reads_outputs:
+            psi = None if model.signals.azimuth is None else blades[0]
+            groups["outputs"] = model.output(states, u, w, p, psi, blades[1])
+        pairs = zip(self.sources, self.factors, strict=True)
+        return jnp.stack([groups[group][column] * factor for (group, column), factor in pairs])
+
+    def commands_of(self, exogenous: jax.Array) -> jax.Array:
+        """What the controller would have set, in its units, ``(command,)``."""
+        return exogenous[jnp.array(self.commanded)] / jnp.array(self.command_factors)
+
+    def with_commands(self, exogenous: jax.Array, commands: jax.Array) -> jax.Array:
+        """Exogenous inputs ``(..., exogenous)`` with the controls set, in the model's units.
+
+        Controls stand first among them. Put together instead of written over: XLA compiles no loop
+        in one piece that holds a scatter.
+        """
+        commands = jnp.broadcast_to(commands, (*exogenous.shape[:-1], len(self.commanded)))
+        last = max(self.commanded, default=-1) + 1
+        columns = [
+            commands[..., self.commanded.index(i)] if i in self.commanded else exogenous[..., i]
+            for i in range(last)
+        ]
+        return jnp.concatenate([jnp.stack(columns, axis=-1), exogenous[..., last:]], axis=-1)
+
+    def in_model_units(self, commands: jax.Array) -> jax.Array:
+        """Commands ``(..., command)`` of the controller in the model's units."""
+        return commands * jnp.array(self.command_factors)
+
+
+def connect(
+    model: DFSM, controller: Controller, measurements: Mapping[str, str] | None = None
+) -> Wires:
+    """Connect a controller to a model by names of channels.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    controller
+        Reads states, their derivatives (``<state>_dot``), controls, disturbances, parameters or
+        outputs of the model, and sets controls.
+    measurements
+        Which signal of the model stands for a measurement that has another name.
+
+    Raises
+    ------
+    DfsmError
+        The model lacks a measurement or command, or its unit is not one that converts.
+    """
+    measurements = dict(measurements or {})
+    for name in measurements:
+        if name not in controller.measurements:
+            raise DfsmError(
+                f"measurements: the controller does not read '{name}'; "
+                + near_matches(name, controller.measurements)
+            )
+    known = _signals(model)
+    sources, factors = [], []
+    for name, unit in zip(controller.measurements, controller.measurement_units, strict=True):
+        signal = measurements.get(name, name)
+        if signal not in known:
+            raise _not_measured(name, signal, model)
+        source, its = known[signal]
+        sources.append(source)
+        factors.append(_factor(signal, its, unit))
+    controls = model.signals.controls
+    names, commanded, command_factors = model.signals.names("controls"), [], []
+    for name, unit in zip(controller.commands, controller.command_units, strict=True):
+        if name not in names:
+            raise DfsmError(
+                f"the controller sets '{name}', which is no control of the model; "
+                + near_matches(name, names)
+            )
+        commanded.append(names.index(name))
+        command_factors.append(1 / _factor(name, controls[commanded[-1]].unit, unit))
+    return Wires(tuple(sources), tuple(factors), tuple(commanded), tuple(command_factors))
+
+
+def not_commanded(model: DFSM, controller: Controller) -> list[str]:
+    """Controls that a controller does not set."""
+    return [n for n in model.signals.names("controls") if n not in controller.commands]
+
+
+def _signals(model: DFSM) -> dict[str, tuple[tuple[str, int], str]]:
+    """Where every signal stands, and its unit."""
+    s = model.signals
+    found: dict[str, tuple[tuple[str, int], str]] = {}
+    for i, state in enumerate(s.observed):
+        found[f"{state.name}{_RATE}"] = (("rates", i), per_second(state.unit))
+    for group in ("outputs", "parameters", "disturbances", "controls", "states"):
+        channels = s.observed if group == "states" else getattr(s, group)
+        found |= {c.name: ((group, i), c.unit) for i, c in enumerate(channels)}
+    return found
+
+
+def _not_measured(name: str, signal: str, model: DFSM) -> DfsmError:
+    if signal != name:
+        return DfsmError(
+            f"measurements: the model has no '{signal}' to stand for '{name}'; "
+            + near_matches(signal, _signals(model))
+        )
+    states = model.signals.names("states")
+    second = [s.name for s in model.signals.specs if s.order == 2]
+    stand_in = f"{second[0]}{_RATE}{_RATE}" if second else f"{states[0]}{_RATE}"
+    return DfsmError(
+        f"the controller measures '{name}', which the model does not have: fit it with '{name}' "
+        "among its outputs, or name a signal of the model that stands for it, as in "
+        f"measurements={{'{name}': '{stand_in}'}} ({stand_in} is the derivative of the state "
+        f"{stand_in.removesuffix(_RATE)})"
+    )
+
+
+def _factor(name: str, source: str, target: str) -> float:
+    """What one unit `source` is in `target`."""
+    if agree(source, target):
+        return 1.0
+    size = factor(source, target)
+    if size is not None:
+        return size
+    raise DfsmError(
+        f"'{name}' is in '{source}' in the model and in '{target}' in the controller, which do not "
+        "convert into each other: change one of them"
+    )
