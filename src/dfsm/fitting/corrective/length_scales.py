@@ -41,7 +41,8 @@ def hyper_parameters(z: Array, targets: Array, seed: int) -> tuple[float, float,
     with warnings.catch_warnings():
         # A length scale at its bound means an input that does not matter: nothing to act on.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        process = GaussianProcessRegressor(kernel, optimizer=_optimum, random_state=seed)
+        optimizer: Any = _optimum
+        process = GaussianProcessRegressor(kernel, optimizer=optimizer, random_state=seed)
         fitted: Any = process.fit(z, targets).kernel_
     lengths = np.broadcast_to(fitted.k1.k2.length_scale, (d,))
     return float(fitted.k1.k1.constant_value), float(fitted.k2.noise_level), lengths
