@@ -219,4 +219,4 @@ def test_the_example_tells_what_both_studies_found(monkeypatch, capsys):
     assert "truth: m2 = 2.4967 kg, cost 0.98313" in out
     assert "from 4 runs:" in out
     assert "round 1: predicted" in out
-    assert "truth: 5.23373" in out
+    assert "truth: 5.23374" in out

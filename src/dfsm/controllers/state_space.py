@@ -181,7 +181,8 @@ def regulator_gain(
     """
     A, B, Q, R = (np.asarray(a, dtype=float) for a in (A, B, Q, R))
     none = np.zeros((1, len(A)))
-    Ad, Bd, *_ = cont2discrete((A, B, none, np.zeros((1, B.shape[1]))), interval)
+    discrete: Any = cont2discrete((A, B, none, np.zeros((1, B.shape[1]))), interval)
+    Ad, Bd = discrete[:2]
     try:
         P = solve_discrete_are(Ad, Bd, Q, R)
     except (LinAlgError, ValueError) as error:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dfsm.controllers.controller import Controller
 from dfsm.core.files import json_value
 from dfsm.core.settings import require, settings_class
-from dfsm.core.units import POWERS, plain
+from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
 from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
@@ -250,11 +250,11 @@ def _over_all(
         figures = {n: Figures.over([run[n] for run in whole], weights) for n in whole[0]}
     energy = overshoot = None
     if settings.power in figures:
-        kilowatts = POWERS.get(plain(units[settings.power]))
+        kilowatts = factor(units[settings.power], "kW")
         if kilowatts is None:
             raise DfsmError(
-                f"power: '{settings.power}' is in '{units[settings.power]}', expected one of "
-                f"{', '.join(POWERS)}"
+                f"power: '{settings.power}' is in '{units[settings.power]}', expected a power "
+                "(W, kW or MW): name another channel"
             )
         mean = figures[settings.power].mean * kilowatts
         energy = mean * sum(weights) * HOURS_PER_YEAR / 1e3

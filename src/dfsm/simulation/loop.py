@@ -212,18 +212,18 @@ class HostLoop:
 
         # Not `filter_jit`, whose own work would be most of a call's time.
         @jax.jit
-        def seen(arrays: Any, x: Array, v: Array, blades: Any) -> jax.Array:
+        def seen(arrays: Any, x: jax.Array, v: jax.Array, blades: Any) -> jax.Array:
             return wires.measured(eqx.combine(arrays, rest), x, jnp.asarray(v), blades)
 
         @jax.jit
-        def on(arrays: Any, x: Array, psi: Array, h: Array, legs: Any) -> Any:
+        def on(arrays: Any, x: jax.Array, psi: jax.Array, h: jax.Array, legs: Any) -> Any:
             model, v, commands, field = eqx.combine(arrays, rest), *legs
             driven = wires.with_commands(jnp.asarray(v), wires.in_model_units(commands))
             path = []
             for leg in range((len(v) - 1) // 2):
                 x, psi = _plant_step(model, x, psi, h, tuple(driven[2 * leg + i] for i in range(3)))
                 path.append(x)
-            now = wires.measured(model, x, driven[-1], (psi, field))
+            now = wires.measured(model, x, driven[-1], (psi, jnp.asarray(field)))
             return jnp.stack(path), psi, now
 
         self._seen = partial(seen, arrays)
