@@ -150,7 +150,8 @@ def refine(
             ended.append(why)
     refined = parameters.at(jnp.asarray(at))
     if refined.signals.latents:
-        paths = [record.latent_states(refined) for group in first.train for record in group]
+        seen = first.train if len(trials) == 1 else records
+        paths = [record.latent_states(refined) for group in seen for record in group]
         refined = with_latent_range(refined, paths)
     return _result(model, refined, trials, (history, ended))
 
