@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.state_space import StateFeedback, regulator_gain
@@ -85,7 +86,7 @@ def linear_quadratic(
         np.diag(np.array(list(controls.values())) ** -2.0),
         interval,
     )
-    summing = gain[:, n:] @ summed if m else None
+    summing = jnp.asarray(gain[:, n:] @ summed) if m else None
     return StateFeedback(
         gain=gain[:, :n],
         integral_gain=summing,

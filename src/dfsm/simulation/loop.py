@@ -212,11 +212,11 @@ class HostLoop:
 
         # Not `filter_jit`, whose own work would be most of a call's time.
         @jax.jit
-        def seen(arrays: Any, x: Array, v: Array, blades: Any) -> jax.Array:
+        def seen(arrays: Any, x: Any, v: Any, blades: Any) -> jax.Array:
             return wires.measured(eqx.combine(arrays, rest), x, jnp.asarray(v), blades)
 
         @jax.jit
-        def on(arrays: Any, x: Array, psi: Array, h: Array, legs: Any) -> Any:
+        def on(arrays: Any, x: Any, psi: Any, h: Any, legs: Any) -> Any:
             model, v, commands, field = eqx.combine(arrays, rest), *legs
             driven = wires.with_commands(jnp.asarray(v), wires.in_model_units(commands))
             path = []
