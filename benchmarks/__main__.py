@@ -1,9 +1,10 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [unseen]
-    [limits] [matched] [control] [codesign] [peer]
+    [limits] [matched] [control] [codesign] [peer] [fuzz] [kill]
 
-Without names all but `peer`, which makes an environment of its own and installs jax-sysid there.
+Without names all but `peer`, which makes an environment of its own and installs jax-sysid there,
+and `fuzz` and `kill`, which damage inputs and end commands for hours (``fuzz --inputs 20000``).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import os
 import platform
 import warnings
+from collections.abc import Callable
 
 import dfsm
 from benchmarks import (
@@ -20,6 +22,8 @@ from benchmarks import (
     codesign,
     control,
     derivatives,
+    fuzz,
+    kill,
     limits,
     matched,
     parameters,
@@ -31,7 +35,7 @@ from benchmarks import (
 )
 from dfsm.core.files import json_value
 
-PARTS = {
+PARTS: dict[str, Callable[..., object]] = {
     "derivatives": derivatives.run,
     "accuracy": accuracy.run,
     "speed": speed.run,
@@ -44,14 +48,21 @@ PARTS = {
     "control": control.run,
     "codesign": codesign.run,
     "peer": peer.run,
+    "fuzz": fuzz.run,
+    "kill": kill.run,
 }
+# Run where they are named alone.
+NAMED = ("peer", "fuzz", "kill")
 
 
 def main() -> None:
-    """Run the parts named on the command line, or all but the peer."""
+    """Run the parts named on the command line, or all that take minutes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}")
-    names = parser.parse_args().parts or [n for n in PARTS if n != "peer"]
+    parser.add_argument("--inputs", type=int, default=20_000, help="of fuzz")
+    parser.add_argument("--seed", type=int, default=0, help="of fuzz")
+    arguments = parser.parse_args()
+    names = arguments.parts or [n for n in PARTS if n not in NAMED]
     unknown = [n for n in names if n not in PARTS]
     if unknown:
         parser.error(f"no part '{unknown[0]}'; choose from {', '.join(PARTS)}")
@@ -62,7 +73,8 @@ def main() -> None:
     }
     warnings.simplefilter("ignore", dfsm.DfsmWarning)
     for name in names:
-        figures[name] = PARTS[name]()
+        given = (arguments.inputs, arguments.seed) if name == "fuzz" else ()
+        figures[name] = PARTS[name](*given)
     print(json.dumps(json_value(figures), indent=2))
 
 

@@ -69,6 +69,17 @@ def known_table(figures: Mapping[str, Any]) -> list[str]:
     return Table("known", "", ("problem", "optimum", *methods.values()), _minus(rows)).markdown()
 
 
+def estimates_table(figures: Mapping[str, Any]) -> list[str]:
+    """True error of the objective beside its estimate, by both transcriptions."""
+    schemes = {"hermite_simpson": "Hermite–Simpson", "radau": "Radau 3"}
+    heads = [f"{label}, {what}" for label in schemes.values() for what in ("true", "estimated")]
+    rows = []
+    for name, results in figures.items():
+        pairs = [(results[k]["relative_error"], results[k]["estimate"]) for k in schemes]
+        rows.append((name, *(cell_text(value, 2) for pair in pairs for value in pair)))
+    return Table("estimates", "", ("problem", *heads), _minus(rows)).markdown()
+
+
 def _solved(result: Mapping[str, Any] | None) -> str | None:
     if result is None:
         return None

@@ -49,6 +49,7 @@ CODESIGN_TABLES = {
 # By the part of the figures that each shows.
 CONTROL_TABLES = {
     "known": ("known", control_tables.known_table),
+    "estimates": ("known", control_tables.estimates_table),
     "orders": ("orders", control_tables.orders_table),
     "control_speed": ("turbine", control_tables.control_speed_table),
     "expressions": ("expressions", control_tables.expressions_table),

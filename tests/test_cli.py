@@ -36,7 +36,7 @@ HOSTILE = (
 
 
 def test_info_lists_every_run_and_channel(here, dfsm):
-    shown = dfsm("info", "train/a.csv", "train/*.outb")
+    shown = dfsm("info", "--each", "train/a.csv", "train/*.outb")
     assert shown.code == 0
     assert shown.err == ""
     assert not CONSOLE.search(shown.out)
@@ -113,7 +113,7 @@ def test_init_writes_a_config_that_reads_back_and_fits(here, dfsm):
     assert "wrote config.yaml" in shown.out
     config = parse_config(Path("config.yaml"))
     assert config.data.train == ["r0.csv", "r1.csv", "r2.csv"]
-    assert [(s.name, s.order) for s in config.signals.states] == [("PtfmPitch", 2), ("GenSpeed", 2)]
+    assert [(s.name, s.order) for s in config.signals.states] == [("PtfmPitch", 2), ("GenSpeed", 1)]
     assert config.signals.controls == ["GenTq", "BldPitch1"]
     assert config.signals.disturbances == ["RotWind"]
     assert config.linear.kind == "LPV"

@@ -14,6 +14,9 @@ from dfsm.control import DirectTranscription, solve
 ROOT = Path(__file__).parents[1]
 
 
+POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+
+
 def documented(name: str) -> list[list[str]]:
     """Rows of a table of the page, below its head."""
     text = (ROOT / "docs" / "optimal-control.md").read_text(encoding="utf-8")
@@ -63,6 +66,23 @@ def test_known_answers_in_a_table():
         {"P": {"value": -0.5, "hermite_simpson": found, "radau": short}}
     )
     assert lines[2] == "| P | −0.5 | 3.2·10⁻⁸, 7, 0.051 s | coarse | – |"
+
+
+def test_true_and_estimated_errors_stand_side_by_side():
+    hs, radau = ({"relative_error": e, "estimate": 2 * e} for e in (1e-7, 3e-9))
+    lines = control_tables.estimates_table({"P": {"hermite_simpson": hs, "radau": radau}})
+    assert lines[2] == "| P | 1.0·10⁻⁷ | 2.0·10⁻⁷ | 3.0·10⁻⁹ | 6.0·10⁻⁹ |"
+
+
+def test_the_documented_estimates_are_within_a_factor_of_ten():
+    rows = documented("estimates")
+    assert [row[0] for row in rows] == list(PROBLEMS)
+    for row in rows:
+        errors = [float(cell.replace("·10", "e").translate(POWERS)) for cell in row[1:]]
+        for true, estimated in (errors[:2], errors[2:]):
+            # Below its tolerance the solver says nothing.
+            ratio = max(estimated, control.TOLERANCE) / max(true, control.TOLERANCE)
+            assert 0.1 <= ratio <= 10, row
 
 
 def test_orders_below_the_tolerance_are_in_brackets():

@@ -35,6 +35,10 @@ def test_known_answers(name, scheme):
     assert found.error <= method.refine
     assert found.violation <= 1e-7
     assert relative_error(found.objective, name) < 1e-6
+    assert max(found.errors[k] for k in ("dynamics", "cost", "constraints")) <= method.refine
+    # Below its tolerance the solver says nothing.
+    true = max(relative_error(found.objective, name), method.tolerance)
+    assert 0.1 <= max(found.errors["objective"], method.tolerance) / true <= 10
     assert found.objective == pytest.approx(found.final_cost + found.integral_cost)
 
 

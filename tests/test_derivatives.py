@@ -216,12 +216,6 @@ def test_units_follow_the_state():
             {},
             "is not the second derivative .* a channel in 'deg/s.2' is expected",
         ),
-        ([StateSpec(name="flat")], {}, "state 'flat' is constant"),
-        (
-            [StateSpec(name="q", order=2, rate="still", acceleration="qdd")],
-            {},
-            "rate of state 'q' is constant",
-        ),
         ([StateSpec(name="holes")], {}, "channel 'holes' has 2 NaN or infinite samples"),
         ([StateSpec(name="taken", order=2)], {}, "there is a channel 'taken_dot' already"),
         (

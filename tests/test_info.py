@@ -10,6 +10,7 @@ import numpy as np
 from dfsm.data.info import describe
 from dfsm.data.readers import read
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind import wind_warning
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 
@@ -28,8 +29,12 @@ def test_a_bundled_run():
     assert pitch.max == run["PtfmPitch"].max()
     np.testing.assert_allclose(pitch.mean, np.sum(run["PtfmPitch"]) / 14001)
     np.testing.assert_allclose(pitch.std, np.sqrt(np.var(run["PtfmPitch"])))
+    transient, relative, same, azimuth = info.warnings
+    assert transient.startswith("a transient, until 6.1 s in 'PtfmRVyt', is far from all")
+    assert relative == wind_warning("RtVAvgxh")
     # with pitch as the only motion the nacelle turns as the platform does
-    assert info.warnings == ("'NcIMURAys' holds the same data as 'PtfmRAyt'",)
+    assert same == "'NcIMURAys' holds the same data as 'PtfmRAyt'"
+    assert azimuth.startswith("'LSSTipPxa' wraps at 360 deg, 59 times, first at ")
 
 
 def test_constant_nan_duplicate_and_invalid_channels_are_told():
@@ -79,3 +84,21 @@ def test_to_dict_is_strict_json():
     assert again["channels"][1]["step"] == 0.5
     run = Trajectory(np.arange(3), np.ones((3, 1)), (Channel("a"),))
     assert describe(run).to_dict()["interval"] == 1
+
+
+def test_a_long_run_is_described_part_by_part(monkeypatch):
+    rng = np.random.default_rng(0)
+    values = 1e4 + rng.normal(size=(1000, 4))
+    values[:, 1] = np.nan
+    values[[3, 500], 2] = np.nan, np.inf
+    values[:, 3] = values[:, 0]
+    channels = tuple(Channel(n, "m") for n in "abcd")
+    run = Trajectory(0.1 * np.arange(1000), values, channels)
+    at_once = describe(run)
+    monkeypatch.setattr("dfsm.data.info._BLOCK", 64)
+    in_parts = describe(run)
+    assert in_parts.warnings == at_once.warnings
+    assert "'d' holds the same data as 'a'" in at_once.warnings
+    for one, other in zip(at_once.channels, in_parts.channels, strict=True):
+        figures = [(c.min, c.max, c.mean, c.std) for c in (one, other)]
+        np.testing.assert_allclose(*figures, rtol=1e-12, equal_nan=True)

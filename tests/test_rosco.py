@@ -17,9 +17,10 @@ from dfsm.control import (
     save_solution,
     solve,
 )
+from dfsm.control.flown import commands_told
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.exports.rosco import write_rosco
 from dfsm.numerics.fatigue import damage_equivalent_load
 from dfsm.simulators import ODESystem
@@ -104,7 +105,72 @@ def test_the_file_holds_time_pitch_and_torque_in_units_of_rosco(solution, tmp_pa
         "Ind_Breakpoint": "1",
         "Ind_BldPitch": "2 2 2",
         "Ind_GenTq": "3",
-    }
+        "PC_ControlMode": "1",
+        "PA_Mode": "0",
+    } | {k: written.discon[k] for k in ("PC_MinPit", "PC_MaxPit", "PC_MinRat", "PC_MaxRat")}
+
+
+def test_limits_that_the_pitch_needs_are_printed_and_none_is_narrower(solution, tmp_path):
+    written = write_rosco(solution, tmp_path / "ol.dat")
+    time, pitch = table(tmp_path / "ol.dat")[:, :2].T
+    rates = np.diff(pitch) / np.diff(time)
+    needs = {k: float(v) for k, v in written.discon.items() if k.startswith("PC_M")}
+    assert needs["PC_MinPit"] <= pitch.min() + 1e-9
+    assert pitch.max() - 1e-9 <= needs["PC_MaxPit"] <= pitch.max() + 1e-4
+    assert -needs["PC_MinRat"] == needs["PC_MaxRat"] >= np.abs(rates).max() - 1e-9
+    assert "lets the torque pass beyond VS_MaxTq" in " ".join(written.lines())
+
+
+def test_a_model_with_an_actuator_keeps_that_of_rosco_off_the_list(solution, tmp_path):
+    def with_state(run):
+        named = (replace(c, name="BldPitch") if c.role == "state" else c for c in run.channels)
+        return replace(run, channels=tuple(named))
+
+    own = replace(solution, trajectories=tuple(map(with_state, solution.trajectories)))
+    written = write_rosco(own, tmp_path / "ol.dat", pitch="BldPitch1")
+    assert "PA_Mode" not in written.discon
+    assert any("its own pitch actuator" in note for note in written.notes)
+
+
+def test_negative_torque_is_warned_of(solution, tmp_path):
+    def lowered(run):
+        values = np.array(run.values)
+        values[:, run.names.index("GenTq")] -= 1e5
+        return replace(run, values=values)
+
+    below = replace(solution, trajectories=tuple(map(lowered, solution.trajectories)))
+    with pytest.warns(DfsmWarning, match=r"torque is negative in 61 of 61 rows.* ROSCO makes it 0"):
+        write_rosco(below, tmp_path / "ol.dat")
+
+
+DISCON = """! a deck
+{lowest}      ! PC_MinPit    - Lowest pitch, [rad]
+1.57          ! PC_MaxPit    - Highest pitch, [rad]
+0.1           ! PC_MaxRat    - Fastest pitch, [rad/s]
+-0.1          ! PC_MinRat    - Fastest pitch, [rad/s]
+{mode}        ! PA_Mode      - Pitch actuator
+1             ! PC_ControlMode
+{most}        ! VS_MaxTq     - Most torque, [Nm]
+1D9           ! VS_MaxRat    - Fastest torque, [Nm/s]
+"""
+
+
+def test_every_limit_of_a_deck_that_the_file_breaks_is_named(solution, result, tmp_path, dfsm):
+    wide, narrow = tmp_path / "wide.IN", tmp_path / "narrow.IN"
+    wide.write_text(DISCON.format(lowest="-0.2", mode=0, most="1e9"), "ascii")
+    narrow.write_text(DISCON.format(lowest="0.5", mode=2, most="1e3"), "ascii")
+    passed = write_rosco(solution, tmp_path / "ol.dat", discon=wide)
+    assert len(passed.notes) == 1
+    assert float(passed.discon["PC_MinPit"]) == -0.2
+    assert float(passed.discon["PC_MaxPit"]) == 1.57
+    broken = write_rosco(solution, tmp_path / "ol.dat", discon=narrow).notes[1:]
+    assert [note.split()[0] for note in broken] == ["PA_Mode", "PC_MinPit", "VS_MaxTq"]
+    assert "which ROSCO lets pass" in broken[2]
+    shown = dfsm("export-rosco", result, "-o", tmp_path / "ol.dat", "--discon", narrow)
+    assert "PC_MinPit is 0.5: the file goes to" in shown.out
+    narrow.write_text("nothing of ROSCO\n", "ascii")
+    with pytest.raises(DfsmError, match="expected a DISCON file of ROSCO"):
+        write_rosco(solution, tmp_path / "ol.dat", discon=narrow)
 
 
 @pytest.mark.parametrize(("torque", "factor"), [("N-m", 1.0), ("MN·m", 1e6), ("kN-m", 1e3)])
@@ -130,11 +196,11 @@ def test_torque_alone_and_rows_between_the_nodes(solution, tmp_path):
 
 def test_controls_that_are_none_or_too_many_earn_a_sentence(solution, tmp_path):
     path = tmp_path / "ol.dat"
-    nothing = with_units(solution, GenTq="mN-m", BldPitch1="%")
-    with pytest.raises(DfsmError, match="its controls are GenTq in 'mN-m', BldPitch1 in '%'"):
+    nothing = with_units(solution, GenTq="kN", BldPitch1="%")
+    with pytest.raises(DfsmError, match="its controls are GenTq in 'kN', BldPitch1 in '%'"):
         write_rosco(nothing, path)
-    both = with_units(solution, BldPitch1="kN m")
-    with pytest.raises(DfsmError, match="the torque may be GenTq or BldPitch1"):
+    both = with_names(with_units(solution, BldPitch1="kN m"), BldPitch1="GenTorque")
+    with pytest.raises(DfsmError, match="the torque may be GenTq or GenTorque"):
         write_rosco(both, path)
     assert write_rosco(both, path, torque="GenTq").torque == "GenTq"
     with pytest.raises(DfsmError, match="pitch: 'GenTq' is in 'kN-m', expected an angle"):
@@ -145,6 +211,24 @@ def test_controls_that_are_none_or_too_many_earn_a_sentence(solution, tmp_path):
         write_rosco(solution, path, scenario=2)
     with pytest.raises(DfsmError, match="step is -1"):
         write_rosco(solution, path, step=-1)
+
+
+def test_a_unit_alone_makes_no_control_the_pitch_or_the_torque(solution, tmp_path):
+    path = tmp_path / "ol.dat"
+    yaws = with_names(solution, BldPitch1="NacYaw")
+    with pytest.raises(DfsmError, match=r"NacYaw in 'deg' has no name .* with --pitch"):
+        write_rosco(yaws, path)
+    assert not path.exists()
+    assert write_rosco(yaws, path, pitch="NacYaw").pitch == "NacYaw"
+    alone = write_rosco(yaws, path, torque="GenTq")
+    assert (alone.pitch, alone.discon["Ind_BldPitch"]) == (None, "0 0 0")
+    slow = with_names(solution, GenTq="RotTorq", BldPitch1="PtchPMzc1")
+    with pytest.raises(DfsmError, match=r"RotTorq in 'kN-m' has no name .* with --torque"):
+        write_rosco(slow, path)
+    assert write_rosco(slow, path, pitch="PtchPMzc1").torque is None
+    # A yaw beside what is known by its name is no reason to ask.
+    beside = with_names(with_units(solution, GenTq="deg"), GenTq="NacYaw")
+    assert write_rosco(beside, path).pitch == "BldPitch1"
 
 
 def test_the_command_prints_what_to_set(result, tmp_path, dfsm):
@@ -208,9 +292,82 @@ def test_runs_that_do_not_fit_earn_a_sentence(solution, run):
     other = tuple(replace(c, name="x" + c.name) for c in run.channels)
     with pytest.raises(DfsmError, match="no channels 'GenSpeed'"):
         check_run(solution, replace(run, channels=other))
-    other = tuple(replace(c, unit="rad/s" if c.unit == "rpm" else c.unit) for c in run.channels)
-    with pytest.raises(DfsmError, match="'GenSpeed' is in 'rad/s', in the solution in 'rpm'"):
+    other = tuple(replace(c, unit="m/s" if c.unit == "rpm" else c.unit) for c in run.channels)
+    with pytest.raises(DfsmError, match="'GenSpeed' is in 'm/s', in the solution in 'rpm'"):
         check_run(solution, replace(run, channels=other))
+
+
+def test_a_run_in_other_units_is_converted(solution, run):
+    size = {"GenSpeed": ("rad/s", np.pi / 30), "GenTq": ("N·m", 1e3), "BldPitch1": ("degrees", 1)}
+    units, sizes = zip(*(size.get(c.name, (c.unit, 1)) for c in run.channels), strict=True)
+    channels = tuple(replace(c, unit=u) for c, u in zip(run.channels, units, strict=True))
+    with pytest.warns(DfsmWarning, match="'GenSpeed' from rad/s to rpm, 'GenTq' from N·m to kN-m"):
+        found = check_run(solution, replace(run, values=run.values * sizes, channels=channels))
+    as_it_was = check_run(solution, run)
+    assert found.channels["GenTq"].rmse == pytest.approx(as_it_was.channels["GenTq"].rmse)
+    assert found.power["actual"] == pytest.approx(as_it_was.power["actual"])
+
+
+def test_power_is_that_of_one_shaft_or_the_runs_own(solution, run):
+    geared = with_names(solution, GenSpeed="RotSpeed")
+    turned = replace(
+        run,
+        channels=tuple(
+            replace(c, name="RotSpeed" if c.name == "GenSpeed" else c.name) for c in run.channels
+        ),
+    )
+    product = np.trapezoid(run["GenTq"] * run["GenSpeed"] * np.pi / 30, run.time) / 30
+    found = check_run(geared, turned)
+    assert found.power is None
+    assert "gearbox ratio between them with --ratio" in found.power_advice
+    assert check_run(geared, turned, ratio=97).power["actual"] == pytest.approx(97 * product)
+    with pytest.raises(DfsmError, match="ratio is -1, expected a number above 0"):
+        check_run(geared, turned, ratio=-1)
+    made = turned.with_channels([Channel("GenPwr", "MW")], np.full(len(run), 2.5))
+    made = made.with_channels([Channel("RotPwr", "kW")], np.full(len(run), 9.0))
+    found = check_run(geared, made)
+    assert found.power == {"predicted": None, "actual": pytest.approx(2500)}
+    assert found.power_source == "GenPwr"
+    found = check_run(solution, run.with_channels([Channel("Power", "kW")], np.full(len(run), 9.0)))
+    assert found.power["actual"] == pytest.approx(9)
+    assert found.power_source == "GenTq × GenSpeed → Power"
+
+
+FLOWN = {
+    "as commanded": (lambda t, a: a, None),
+    "cut": (lambda t, a: np.maximum(a, 2.0), "held at 2 from below"),
+    "not taken": (lambda t, a: 0 * a, "stays at 0 throughout"),
+    "late": (lambda t, a: np.interp(t - 0.6, t, a), "about 0.6 s late"),
+    "shifted": (lambda t, a: a + 0.7, "differs by 0.7 throughout"),
+}
+
+
+@pytest.mark.parametrize("case", FLOWN)
+def test_controls_flown_otherwise_are_told_with_the_cause(case):
+    change, cause = FLOWN[case]
+    time = np.linspace(0, 30, 601)
+    channels = (Channel("BldPitch1", "deg", role="control"),)
+    pitch = 3 + 3 * np.sin(0.5 * time) + np.sin(1.3 * time)
+    told = commands_told(
+        Trajectory(time, pitch[:, None], channels),
+        Trajectory(time, change(time, pitch)[:, None], channels),
+    )
+    if cause is None:
+        assert told == ()
+    else:
+        assert "BldPitch1 was flown otherwise than commanded" in told[0]
+        assert cause in told[0]
+
+
+def test_a_rate_limit_is_told_as_one():
+    time = np.linspace(0, 30, 601)
+    pitch = 3.0 * (np.sin(1.5 * time) > 0)
+    flown = np.zeros_like(pitch)
+    for k in range(600):
+        flown[k + 1] = flown[k] + np.clip(pitch[k + 1] - flown[k], -0.1, 0.1)
+    channels = (Channel("BldPitch1", "deg", role="control"),)
+    runs = (Trajectory(time, v[:, None], channels) for v in (pitch, flown))
+    assert "rate stays below 2 per second: a rate limit" in commands_told(*runs)[0]
 
 
 def test_limits_survive_saving(solution, result, run):
@@ -228,6 +385,14 @@ def test_the_command_prints_tables_and_json(result, run, tmp_path, dfsm):
     found = json.loads(shown.out)
     assert found["limits"]["GenSpeed"]["actual"] > 0.05
     assert "no.parquet" in dfsm("check-run", result, "no.parquet").sentence
+
+
+def with_names(solution, **names):
+    def changed(run):
+        channels = [replace(c, name=names.get(c.name, c.name)) for c in run.channels]
+        return replace(run, channels=tuple(channels))
+
+    return replace(solution, trajectories=tuple(map(changed, solution.trajectories)))
 
 
 def with_units(solution, **units):

@@ -13,11 +13,14 @@ from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
 from dfsm.data.readers.turbsim import read_turbsim
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.data.wind_field import disk_wind, with_field_wind
-from dfsm.errors import DfsmError
+from dfsm.data.wind_field import disk_wind, field_signals, with_field_wind
+from dfsm.errors import DfsmError, DfsmWarning
 
 RADIUS, HUB, DY, NY, NZ, COUNT, DT = 50.0, 90.0, 10.0, 13, 14, 40, 0.5
 REAL = Path(__file__).parents[1] / "examples" / "iea15" / "iea15_2dof_12mps_s08"
+
+
+PLACES = {"dz": 0, "dy": 1, "dt": 2, "mean": 3, "hub": 4, "bottom": 5, "slope": 6, "offset": 7}
 
 
 def planes() -> np.ndarray:
@@ -27,7 +30,13 @@ def planes() -> np.ndarray:
 
 
 def field_file(path: Path, kind: int = 7, towers: int = 2, **changes) -> Path:
-    """Write planes (and other components that must not matter) as a TurbSim field."""
+    """Write planes (and other components that must not matter) as a TurbSim field.
+
+    `changes` are of the header alone: its sizes, or numbers by their place among the single ones.
+    """
+    floats = [DY, DY, DT, 10.0, HUB, 25.0, 3000.0, -30000.0]
+    for name, place in PLACES.items():
+        floats[place] = changes.pop(name, floats[place])
     y, z = (np.arange(NY) - (NY - 1) / 2) * DY, 25 + DY * np.arange(NZ)
     up, side = np.meshgrid((z - HUB) / RADIUS, y / RADIUS, indexing="ij")
     a, b, c = planes().T[:, :, None, None]
@@ -42,8 +51,8 @@ def field_file(path: Path, kind: int = 7, towers: int = 2, **changes) -> Path:
     text = b"made by a test"
     header = {"kind": kind, "nz": NZ, "ny": NY, "towers": towers, "count": COUNT} | changes
     head = struct.pack("<h4i", *header.values())
-    head += struct.pack("<6f", DY, DY, DT, 10.0, HUB, 25.0)
-    head += struct.pack("<6fi", slope, offset, 100.0, 0.0, 100.0, 0.0, len(text)) + text
+    head += struct.pack("<8f", *floats)
+    head += struct.pack("<4fi", 100.0, 0.0, 100.0, 0.0, len(text)) + text
     path.write_bytes(head + codes.round().astype("<i2").tobytes())
     return path
 
@@ -153,3 +162,50 @@ def test_the_command_does_not_overwrite_what_it_reads(tmp_path, dfsm: Dfsm):
     assert result.code == 2
     assert "is one of the files to read" in result.err
     assert (tmp_path / "run.parquet").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"mean": np.nan}, r"gives the mean wind \(UHub\) in m/s as nan"),
+        ({"mean": 1e9}, r"gives the mean wind \(UHub\) in m/s as 1e\+09"),
+        ({"dt": np.inf}, r"gives the time step \(dt\) in s as inf"),
+        ({"dt": -0.5}, r"gives the time step \(dt\) in s as -0\.5"),
+        ({"dz": 0.0}, r"gives the grid spacing upwards \(dz\) in m as 0"),
+        ({"hub": np.nan}, r"gives the hub height \(HubHt\) in m as nan"),
+        ({"bottom": -np.inf}, r"gives the height of the lowest points \(ZBot\) in m as -inf"),
+        ({"slope": -3000.0}, "gives the slope of u as -3000"),
+        ({"slope": np.nan}, "gives the slope of u as nan"),
+        ({"offset": np.nan}, "gives the offset of u as nan"),
+        (
+            {"slope": 1e-38},
+            "slope and offset of u in its header, 1e-38 and -30000, make winds from",
+        ),
+    ],
+)
+def test_header_fields_that_make_no_sense_are_named(tmp_path, change, said):
+    with pytest.raises(DfsmError, match=said):
+        read_turbsim(field_file(tmp_path / "f.bts", **change))
+
+
+def test_the_mean_over_the_disk_is_that_of_the_header(tmp_path):
+    with pytest.raises(DfsmError, match=r"10\.0\d m/s on average, the field states 14 m/s"):
+        field_signals(read_turbsim(field_file(tmp_path / "a.bts", mean=14.0)), RADIUS)
+    with pytest.warns(DfsmWarning, match=r"10\.0\d* m/s on average, the field states 11 m/s"):
+        signals = field_signals(read_turbsim(field_file(tmp_path / "b.bts", mean=11.0)), RADIUS)
+    np.testing.assert_allclose(signals["RotWind"], planes()[:, 0], atol=2e-4)
+
+
+def test_the_hub_is_where_it_is_told(tmp_path, dfsm: Dfsm):
+    field = field_file(tmp_path / "f.bts")
+    write_table(run_until(5.0), tmp_path / "run.csv")
+    command = ("wind", field, tmp_path / "run.csv", "--radius", 40, "--harmonics", 0)
+    stated = dfsm(*command, "-o", tmp_path / "a")
+    assert "hub at 90 m, as the field states" in stated.out
+    told = dfsm(*command, "-o", tmp_path / "b", "--hub-height", 80)
+    assert "hub at 80 m, as told" in told.out
+    a, b = (read(tmp_path / n / "run.parquet") for n in "ab")
+    lower = a["RotWind"] - 10 / 40 * a["RotShearV"]
+    np.testing.assert_allclose(b["RotWind"], lower, atol=2e-4)
+    wrong = dfsm(*command, "-o", tmp_path / "c", "--hub-height", 400)
+    assert "a hub at 400 m is not within the field, which covers heights of 25" in wrong.sentence

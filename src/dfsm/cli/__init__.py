@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +21,25 @@ from dfsm.cli.closed_loop import closed_loop
 from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
-from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, lines, print_json, say, working
+from dfsm.cli.terminal import (
+    AsJson,
+    Files,
+    Interpolation,
+    Method,
+    ParameterFile,
+    Quiet,
+    SampleStep,
+    Step,
+    as_in_fit,
+    fit_start,
+    lines,
+    marching,
+    parametrized,
+    print_json,
+    say,
+    tell_notes,
+    working,
+)
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, hushed, printable
@@ -51,18 +71,25 @@ IntervalFile = Annotated[
 
 
 @app.command()
-def info(files: Files, as_json: AsJson = False) -> None:
+def info(
+    files: Files,
+    each: Annotated[bool, typer.Option("--each", help="A table for every run.")] = False,
+    step: SampleStep = None,
+    as_json: AsJson = False,
+) -> None:
     """List channels, units, ranges, sampling and quantisation, and what looks wrong."""
-    from dfsm.cli.tables import print_info
+    from dfsm.cli.tables import print_info, print_merged
     from dfsm.data.info import describe
     from dfsm.data.readers import read_all
 
     with show_progress():
-        infos = [describe(run) for run in read_all(files)]
+        infos = [describe(run) for run in read_all(files, step=step)]
     if as_json:
         print_json([i.to_dict() for i in infos])
-    else:
+    elif each or len(infos) == 1:
         print_info(infos)
+    else:
+        print_merged(infos)
 
 
 @app.command()
@@ -72,6 +99,7 @@ def init(
         "config.yaml"
     ),
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    step: SampleStep = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a commented configuration with the channels of the files."""
@@ -82,7 +110,7 @@ def init(
     if output.exists() and not force:
         raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
     with working(quiet):
-        write_config(files, output)
+        write_config(files, output, step)
     say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
 
@@ -90,21 +118,40 @@ def init(
 def fit(
     config: Annotated[Path, typer.Argument(help="Configuration made by dfsm init.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Model folder to write.")],
+    interpolation: Annotated[
+        str | None,
+        typer.Option(
+            help="Inputs between samples, before those of the configuration: hold, linear or "
+            "cubic, or by name, u=hold,w=cubic."
+        ),
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit a multi-fidelity model and save it as a folder."""
     from dfsm.config.fit import load_config
+    from dfsm.core.fallback import write_or_keep
+    from dfsm.core.files import visible
+    from dfsm.core.lock import locked
+    from dfsm.data.between import combined, parse_chosen
     from dfsm.fitting.fit import fit as run_fit
     from dfsm.models.model_folder import check_target, save
+    from dfsm.models.summary import lines_of
 
     check_target(output)
-    with working(quiet):
-        settings, runs = load_config(config)
-        result = run_fit(runs, settings.fit_settings(), settings.refine)
-        model = result.model
-    replaced = output.exists() and any(output.iterdir())
-    save(model, output, result.nonlinear)
+    chosen = parse_chosen(interpolation)
+    with locked(output):
+        with working(quiet):
+            config_settings, runs = load_config(config)
+            tell_notes(runs, quiet)
+            settings = config_settings.fit_settings()
+            if chosen is not None:
+                names = (*settings.controls, *settings.driving)
+                settings = replace(settings, inputs=combined(chosen, settings.inputs, names))
+            result = run_fit(runs, settings, config_settings.refine)
+            model = result.model
+        replaced = output.exists() and bool(visible(output))
+        write_or_keep(lambda path: save(model, path, result.nonlinear), output)
     if replaced and not quiet:
         print(printable(f"note: replaced the model that was in {output}"), file=sys.stderr)
     if as_json:
@@ -112,7 +159,8 @@ def fit(
 
         print_json(json_value(dict(model.provenance.record)))
         return
-    say(lines(model.summary()), quiet)
+    # Its warnings have been shown.
+    say(lines("\n".join(lines_of(model, warnings=False))), quiet)
     seconds = sum(result.seconds.values())
     say(
         f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",
@@ -141,8 +189,12 @@ def compare(
     check_output(output, candidates)
     files, hold_out = settings.compare.validation, settings.compare.hold_out
     with working(quiet):
-        runs = read_all(settings.data.train, config.parent)
-        validation = None if files is None else read_all(files, config.parent)
+        step = settings.data.step
+        runs = settings.with_parameters(read_all(settings.data.train, config.parent, step))
+        validation = None
+        if files is not None:
+            validation = settings.with_parameters(read_all(files, config.parent, step))
+        tell_notes([*runs, *(validation or [])], quiet)
         ranking = run_compare(
             candidates, runs, output, validation=validation, hold_out=hold_out, jobs=jobs
         )
@@ -184,11 +236,16 @@ def validate(
         float | None, typer.Option(help="Start of the test window in s; default as in the fit.")
     ] = None,
     stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
+    method: Method = "rk4",
+    step: Step = None,
+    interpolation: Interpolation = None,
     intervals: IntervalFile = None,
+    parameters: ParameterFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate test runs, compare with what was recorded, write a report."""
     from dfsm.cli.tables import print_validation
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file, write_json
     from dfsm.data.readers import read_all, with_wall_times
     from dfsm.models.model_folder import NONLINEAR, load_all
@@ -197,6 +254,7 @@ def validate(
     from dfsm.validation.validate import compared
     from dfsm.validation.validate import validate as run_validate
 
+    settings = marching(method, step, interpolation)
     targets = [path for path in (output, metrics) if path is not None]
     for path in targets:
         check_file(path)
@@ -205,17 +263,21 @@ def validate(
     start = fit_start(main) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     with working(quiet):
-        runs = read_all(files)
+        runs = as_in_fit(main, parametrized(read_all(files), parameters))
+        tell_notes(runs, quiet)
         for path in targets:
-            check_file(path, [wall_times, intervals, *(r.source for r in runs)])
+            check_file(path, [wall_times, intervals, parameters, *(r.source for r in runs)])
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))
-        validation = run_validate(candidates, runs, start=start, stop=stop, intervals=calibrated)
+        validation = run_validate(
+            candidates, runs, start=start, stop=stop, settings=settings, intervals=calibrated
+        )
         if output is not None:
-            write_report({model.name or str(model): validation}, output)
+            label = model.name or str(model)
+            write_or_keep(lambda path: write_report({label: validation}, path), output)
     if metrics is not None:
-        write_json(metrics, validation.to_dict())
+        write_or_keep(lambda path: write_json(path, validation.to_dict()), metrics)
     if not quiet:
         print_validation(validation)
     for path in targets:
@@ -232,46 +294,57 @@ def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
     start: Annotated[float | None, typer.Option(help="Start in s; default as in the fit.")] = None,
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
-    method: Annotated[str, typer.Option(help="rk4, tsit5 or kvaerno5 (stiff).")] = "rk4",
-    step: Annotated[
-        float | None, typer.Option(help="Largest RK4 step in s; default the run's samples.")
-    ] = None,
+    method: Method = "rk4",
+    step: Step = None,
+    interpolation: Interpolation = None,
     intervals: IntervalFile = None,
+    parameters: ParameterFile = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help='Change a channel: "NAME = 2", or +=, -=, *=; run\'s units.'),
+    ] = None,
+    inputs: Annotated[
+        str | None, typer.Option(help="Table whose columns replace inputs of the run.")
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate the model with the inputs of one run and write states and outputs."""
+    """Simulate the model with the inputs of one run, or others, and write states and outputs."""
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file
     from dfsm.data.readers import read
     from dfsm.data.readers.tables import table_suffix, write_table
+    from dfsm.models.completion import completed
     from dfsm.models.model_folder import load
-    from dfsm.models.signals import with_computed
-    from dfsm.simulation.simulate import METHODS, SimulationSettings
+    from dfsm.models.what_if import with_changes, with_inputs
     from dfsm.simulation.simulate import simulate as run_simulate
     from dfsm.validation.intervals import load_intervals
 
-    if method not in METHODS:
-        raise DfsmError(f"--method is '{method}', expected one of {', '.join(METHODS)}")
+    settings = marching(method, step, interpolation)
     table_suffix(output)
-    check_file(output, [path for path in (run, intervals) if path and Path(path).exists()])
+    check_file(output, [path for path in (run, inputs, intervals) if path and Path(path).exists()])
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     if calibrated is not None:
         calibrated.check(surrogate)
+    with working(quiet):
+        (recorded,) = as_in_fit(surrogate, parametrized([read(run, step)], parameters))
+        tell_notes([recorded], quiet)
+        if inputs is not None:
+            recorded = with_inputs(recorded, read(inputs), surrogate.signals, start, stop)
+        recorded = with_changes(recorded, changes or (), surrogate.signals)
+        recorded = completed(recorded, surrogate.signals)
     with working(quiet), hushed():  # the outcome is printed below
-        signals = surrogate.signals
-        recorded = with_computed(read(run), signals.hub_height, signals.features)
         result = run_simulate(
             surrogate,
             recorded,
             start=start,
             stop=stop,
-            settings=SimulationSettings(method=method, step=step),  # pyright: ignore[reportArgumentType]
+            settings=settings,
         )
-    write_table(
-        result.trajectory if calibrated is None else calibrated.beside(result, recorded), output
-    )
+    table = result.trajectory if calibrated is None else calibrated.beside(result, recorded)
+    write_or_keep(lambda path: write_table(table, path), output)
     if as_json:
         print_json(
             {
@@ -324,6 +397,15 @@ def two_link_robot(
 
 def main() -> None:
     """Run the command line; the only place that turns errors into exit codes."""
+    # Ended by a queue or a service manager, a command cleans up as after Ctrl-C.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        _main()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _main() -> None:
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DfsmWarning)
     if isinstance(sys.stdout, io.TextIOWrapper):

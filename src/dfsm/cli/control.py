@@ -22,6 +22,10 @@ def export_rosco(
     step: Annotated[
         float | None, typer.Option(help="Time between rows in s; default the solution's nodes.")
     ] = None,
+    discon: Annotated[
+        Path | None,
+        typer.Option(help="DISCON.IN to fly it with: limits that it breaks are named."),
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -32,13 +36,20 @@ def export_rosco(
 
     check_file(output)
     written = write_rosco(
-        load_solution(result), output, pitch=pitch, torque=torque, scenario=scenario, step=step
+        load_solution(result),
+        output,
+        pitch=pitch,
+        torque=torque,
+        scenario=scenario,
+        step=step,
+        discon=discon,
     )
     if as_json:
         settings = {
             "pitch": written.pitch,
             "torque": written.torque,
             "discon": dict(written.discon),
+            "notes": list(written.notes),
         }
         print_json({"output": str(output), "rows": written.rows, **settings, "Ptch_Cntrl": 1})
         return
@@ -51,6 +62,10 @@ def check_run(
     result: Result,
     run: Annotated[str, typer.Argument(help="High-fidelity run under the optimal controls.")],
     scenario: Scenario = 1,
+    ratio: Annotated[
+        float | None,
+        typer.Option(help="Speed of the torque's shaft over that of the speed, for the power."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a high-fidelity run under optimal controls with what was predicted."""
@@ -59,7 +74,7 @@ def check_run(
     from dfsm.control import load_solution
     from dfsm.data.readers import read
 
-    comparison = compare(load_solution(result), read(run), scenario)
+    comparison = compare(load_solution(result), read(run), scenario, ratio)
     if as_json:
         print_json(comparison.to_dict())
     else:

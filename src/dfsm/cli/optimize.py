@@ -20,14 +20,16 @@ def optimize(
     from dfsm.config.control import load_problem
     from dfsm.control import solve
     from dfsm.control.solution_folder import PAGE, check_solution_target, save_solution
+    from dfsm.core.fallback import write_or_keep
+    from dfsm.core.lock import locked
     from dfsm.report.solution_page import solution_article, write_solution_report
 
     check_solution_target(output)
-    with working(quiet):
-        problem, method, guess = load_problem(config)
-        solution = solve(problem, method, guess)
-    save_solution(solution, output)
-    write_solution_report(solution, output / PAGE)
+    with locked(output):
+        with working(quiet):
+            problem, method, guess = load_problem(config)
+            solution = solve(problem, method, guess)
+        write_or_keep(lambda path: save_solution(solution, path, write_solution_report), output)
     article = solution_article(solution)
     if as_json:
         from dfsm.core.files import json_value

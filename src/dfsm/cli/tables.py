@@ -24,7 +24,7 @@ _LONG = 45
 
 
 def print_info(runs: Sequence[RunInfo]) -> None:
-    """Print what `dfsm info` says, one table per run."""
+    """Print what `dfsm info` says of each run, one table per run."""
     console = _console()
     for run in runs:
         sampling = (
@@ -42,6 +42,44 @@ def print_info(runs: Sequence[RunInfo]) -> None:
         console.print(table)
         for text in run.warnings:
             console.print(_text(f"warning: {text}"))
+
+
+def print_merged(runs: Sequence[RunInfo]) -> None:
+    """Print what `dfsm info` says of several runs: one table over all, every warning once."""
+    from dfsm.data.info import counted, merged
+
+    console = _console()
+    console.print(_text(f"{len(runs)} runs, {_sampling(runs)}"))
+    table = _table("channel", "unit", "min", "max", "runs", "step")
+    for c in merged(runs):
+        steps = "–" if c.steps is None else " to ".join(f"{s:.3g}" for s in dict.fromkeys(c.steps))
+        of = "all" if c.runs == len(runs) else str(c.runs)
+        table.add_row(
+            _text(c.name), _text(" or ".join(c.units)), f"{c.min:.5g}", f"{c.max:.5g}", of, steps
+        )
+    console.print(table)
+    for text in counted([(run.source or run.name, run.warnings) for run in runs]):
+        console.print(_text(f"warning: {text}"))
+    console.print("dfsm info --each prints every run by itself")
+
+
+def _sampling(runs: Sequence[RunInfo]) -> str:
+    """Spans and intervals of several runs, in one line."""
+    intervals = sorted({r.interval for r in runs if r.interval is not None})
+    samples = sorted({r.samples for r in runs})
+    parts = [
+        f"{_range(samples, 'd')} samples",
+        f"{min(r.start for r in runs):g} to {max(r.stop for r in runs):g} s",
+    ]
+    parts += [f"every {_range(intervals, 'g')} s"] if intervals else []
+    irregular = sum(r.interval is None for r in runs)
+    parts += [f"{irregular} of them irregular"] if irregular else []
+    return ", ".join(parts)
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    low, high = format(values[0], form), format(values[-1], form)
+    return low if low == high else f"{low} to {high}"
 
 
 def print_validation(validation: Validation) -> None:
@@ -88,7 +126,8 @@ def print_validations(validations: Mapping[str, Validation]) -> None:
     )
     console.print(table)
     console.print(
-        "* of the multi-fidelity model, in the channel's unit; – no mean, a rollout ended early"
+        "* of the multi-fidelity model, in the channel's unit; – no mean, a rollout ended early or "
+        "the channel moves in no run"
     )
     if inside:
         console.print("inside: share of the time that the record lies in the prediction intervals")
@@ -146,11 +185,12 @@ def print_ranking(ranking: Ranking) -> None:
         costs = [f"{of - o.diverged} of {of}", str(o.parameters)]
         costs += [f"{o.fit_seconds:.1f} s", f"{1000 * o.simulate_seconds:.0f} ms"]
         costs = ["–"] * len(costs) if c.status == "failed" else costs
-        table.add_row(_text(c.name), *figures, *costs, _text(c.changes))
+        changes = f"{c.changes} (refinement discarded)" if o.discarded else c.changes
+        table.add_row(_text(c.name), *figures, *costs, _text(changes))
     console.print(table)
     states = ", ".join(ranking.states)
     console.print(_text(f"score: root mean square over {states} of the NRMSE of rollouts"))
-    for text in ranking.failures():
+    for text in (*ranking.failures(), *ranking.discarded()):
         console.print(_text(text))
     kept = [c.name for c in ranking.candidates if c.kept]
     if kept:
@@ -168,9 +208,15 @@ def print_check(check: RunCheck) -> None:
     part = "the whole horizon" if check.complete else "a part of the horizon"
     span = f"{check.start:g} to {check.stop:g} s, {part}"
     console.print(_text(f"{check.run} against {check.name}, {span}; figures: predicted → actual"))
+    for sentence in check.commands:
+        console.print(_text(sentence))
+    if check.commands:
+        console.print("so the run is no test of the model before its controls are those commanded")
     if check.power is not None:
-        ahead, came = check.power["predicted"], check.power["actual"]
-        console.print(_text(f"mean power ({check.power_source}): {ahead:.5g} → {came:.5g} kW"))
+        ahead, came = (_figure(check.power[k], ".5g") for k in ("predicted", "actual"))
+        console.print(_text(f"mean power ({check.power_source}): {ahead} → {came} kW"))
+    if check.power_advice:
+        console.print(_text(check.power_advice))
     table = _table("channel", "unit", "mean", "max", "DEL m=4", "DEL m=10", "RMSE", "NRMSE")
     for name, c in check.channels.items():
         a, b = c.predicted, c.actual

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dfsm.cli.terminal import Files, Quiet, say, working
+from dfsm.cli.terminal import Files, Quiet, SampleStep, say, tell_notes, working
 from dfsm.errors import DfsmError
 
 if TYPE_CHECKING:
+    from dfsm.data.trajectory import Trajectory
     from dfsm.data.wind_field import WindField
 
 Box = tuple[int, int, int, float, float, float]
@@ -41,7 +44,11 @@ def wind(
         float | None, typer.Option(help="Mann box: mean wind in m/s at hub height.")
     ] = None,
     hub_height: Annotated[
-        float | None, typer.Option(help="Mann box: height of hub and box in m.")
+        float | None,
+        typer.Option(
+            help="Height of the turbine's hub in m; default the field's. Mann box: also of its "
+            "middle."
+        ),
     ] = None,
     shear: Annotated[
         float | None, typer.Option(help="Mann box: exponent of the mean wind's power law.")
@@ -50,9 +57,11 @@ def wind(
     last_first: Annotated[
         bool, typer.Option("--last-first", help="Mann box: its last plane meets the rotor first.")
     ] = False,
+    step: SampleStep = None,
     quiet: Quiet = False,
 ) -> None:
     """Add the wind over the rotor, its slopes and harmonics to runs: disturbances to fit with."""
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file
     from dfsm.data.readers import read_all
     from dfsm.data.readers.tables import write_table
@@ -62,18 +71,36 @@ def wind(
     radii = None if rings is None else _radii(rings)
     source = _open(field, box, told, last_first)
     with working(quiet):
-        runs = read_all(files)
+        runs = read_all(files, step=step)
+        tell_notes(runs, quiet)
+        targets = _targets(runs, output)
         output.mkdir(parents=True, exist_ok=True)
-        targets = [output / f"{run.name}.parquet" for run in runs]
         for target in targets:
             check_file(target, [run.source for run in runs])
         signals = field_signals(source, radius, harmonics, radii)
         added = [with_signals(run, source, signals) for run in runs]
     more = "RotWind, RotShearV and RotShearH"
     more += f", and harmonics 1 to {harmonics} over rings" if harmonics else ""
+    whose = "as told" if hub_height is not None else "as the field states"
+    say(f"hub at {source.hub_height:g} m, {whose}", quiet)
     for run, target in zip(added, targets, strict=True):
-        write_table(run, target)
+        write_or_keep(partial(write_table, run), target)
         say(f"wrote {target} with {more}", quiet)
+
+
+def _targets(runs: Sequence[Trajectory], output: Path) -> list[Path]:
+    """One file per run, called after the file that it came from."""
+    taken: dict[str, Trajectory] = {}
+    for run in runs:
+        stem = Path(run.where).stem
+        # Systems differ in whether upper and lower case are different names.
+        other = taken.setdefault(stem.casefold(), run)
+        if other is not run:
+            raise DfsmError(
+                f"{other.where} and {run.where} would both be written to {output / stem}.parquet: "
+                "rename one of them, or write them to different folders"
+            )
+    return [output / f"{Path(run.where).stem}.parquet" for run in runs]
 
 
 def _radii(text: str) -> list[float]:
@@ -90,12 +117,13 @@ def _open(
     from dfsm.data.readers.mann import BoxSettings, read_mann
     from dfsm.data.readers.turbsim import read_turbsim
 
-    names = [f"--{name}" for name, value in told.items() if value is not None]
+    names = [f"--{n}" for n, value in told.items() if value is not None and n != "hub-height"]
     if box is None:
         names += ["--last-first"] if last_first else []
         if names:
             raise DfsmError(f"{names[0]} is for a Mann box: give its sizes with --box, or leave it")
-        return read_turbsim(path)
+        field, hub = read_turbsim(path), told["hub-height"]
+        return field if hub is None else field.at_hub(hub)
     mean_wind, hub_height = told["mean-wind"], told["hub-height"]
     if mean_wind is None or hub_height is None:
         lost = "--mean-wind" if mean_wind is None else "--hub-height"

@@ -69,7 +69,7 @@ class ControlConfig(Strict):
         Value of a plant parameter, or its two limits to optimize it.
     initial
         ``free`` within the bounds, or ``recorded`` in the run.
-    scheme, nodes, refine, tolerance, most_iterations, stay_inside
+    scheme, nodes, refine, tolerance, most_iterations, most_seconds, stay_inside
         See `DirectTranscription`; `nodes` are those of the first mesh, intervals plus one.
     name
         For messages.
@@ -89,6 +89,7 @@ class ControlConfig(Strict):
     refine: float | None = None
     tolerance: float = DirectTranscription.tolerance
     most_iterations: int = DirectTranscription.most_iterations
+    most_seconds: float | None = None
     stay_inside: bool = False
     name: str | None = None
 
@@ -119,6 +120,7 @@ def load_problem(
             refine=config.refine,
             tolerance=config.tolerance,
             most_iterations=config.most_iterations,
+            most_seconds=config.most_seconds,
             stay_inside=config.stay_inside,
         )
         problem = OptimalControlProblem(

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError, field_validator
 
 from dfsm.config.parse import Strict, explain, load_yaml, parse_file
 from dfsm.core.settings import require
+from dfsm.data.between import Between
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
 from dfsm.data.features import Feature
+from dfsm.data.parameters import Table, names_in, read_parameters, with_parameters
 from dfsm.data.readers import read_all
+from dfsm.data.slower import Slower
+from dfsm.data.suspects import Suspects
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
@@ -30,6 +34,10 @@ from dfsm.selection.trial import Candidate
 BASE = "base"
 _CANDIDATES = "compare.candidates"
 _ADVICE = "make one with dfsm init"
+_VALUES = "its value in every run, as {run1.outb: 1.0}"
+_PARAMETERS = (
+    "a list of channels, values of runs as {Ballast: {run1.outb: 1.0}}, or the name of a CSV table"
+)
 
 
 class DataConfig(Strict):
@@ -43,23 +51,55 @@ class DataConfig(Strict):
         Time window in s; null leaves that end open.
     hub_height
         In m; adds the corrected rotor wind ``RtVAvgxhCorr`` to every run.
+    step
+        Interval between samples in s of files that hold no time.
+    slower
+        What channels with fewer samples than their table do in between: hold or linear, or by name.
+    outliers
+        What to do with samples and runs that cannot belong to the rest, see `screened`.
     """
 
     train: list[str]
     start: float | None = None
     stop: float | None = None
     hub_height: float | None = None
+    step: float | None = None
+    slower: Slower = None
+    outliers: Suspects = FitSettings.outliers
 
 
 class SignalConfig(Strict):
-    """Channel names by role, see `FitSettings`."""
+    """Channel names by role, see `FitSettings`.
+
+    Parameters that the files do not hold may be given here: ``{Ballast: {run1.outb: 1.0, …}}``, or
+    the name of a CSV table, see `read_parameters`.
+    """
 
     states: list[StateSpec]
     controls: list[str] = Field(default_factory=list)
     disturbances: list[str] = Field(default_factory=list)
     features: list[Feature] = Field(default_factory=list)
-    parameters: list[str] = Field(default_factory=list)
+    parameters: list[str] | dict[str, dict[str, float]] | str = Field(default_factory=list)
     outputs: list[str] = Field(default_factory=list)
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _one_of_three(cls, value: object) -> object:
+        """Say in one sentence what none of the three forms can be."""
+        where = "'signals.parameters'"
+        if isinstance(value, Mapping):
+            for name, values in value.items():
+                require(_numbers(values), f"{where}: '{name}'", values, _VALUES)
+        elif not isinstance(value, str):
+            names = isinstance(value, list) and all(isinstance(n, str) for n in value)
+            require(names, where, value, _PARAMETERS)
+        return value
+
+
+def _numbers(values: object) -> bool:
+    if not (isinstance(values, Mapping) and values):
+        return False
+    return all(isinstance(v, int | float) and not isinstance(v, bool) for v in values.values())
 
 
 class CompareConfig(Strict):
@@ -100,6 +140,7 @@ class Config(Strict):
     corrective: Annotated[CorrectiveSettings, Field(discriminator="kind")] = MLP()
     gate: float = FitSettings.gate
     azimuth: Azimuth | None = None
+    inputs: Between | dict[str, Between] | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
     refine: RefineSettings | None = None
     seed: int = FitSettings.seed
@@ -119,20 +160,39 @@ class Config(Strict):
             controls=tuple(s.controls),
             disturbances=tuple(s.disturbances),
             features=tuple(s.features),
-            parameters=tuple(s.parameters),
+            parameters=self.parameter_names,
             outputs=tuple(s.outputs),
             start=self.data.start,
             stop=self.data.stop,
             hub_height=self.data.hub_height,
+            slower=self.data.slower,
+            outliers=self.data.outliers,
             derivatives=self.derivatives,
             linear=self.linear,
             terms=tuple(self._rooted(term) for term in self.terms),
             corrective=self.corrective,
             gate=self.gate,
             azimuth=self.azimuth,
+            inputs=self.inputs,
             nonlinear_only=self.nonlinear_only,
             seed=self.seed,
         )
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the plant parameters, wherever their values stand."""
+        given = self.signals.parameters
+        return tuple(given if isinstance(given, list) else names_in(self._parameters()))
+
+    def with_parameters(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
+        """Runs with the parameters that the configuration gives."""
+        return with_parameters(runs, self._parameters())
+
+    def _parameters(self) -> Table:
+        given = self.signals.parameters
+        if isinstance(given, str):
+            return read_parameters(self._folder / given)
+        return {} if isinstance(given, list) else given
 
     def _rooted(self, term: TermSettings) -> TermSettings:
         if isinstance(term, Rotor) and isinstance(term.table, str | Path):
@@ -156,7 +216,8 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
         _check_together(config)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
-    return config, read_all(config.data.train, path.parent)
+    runs = read_all(config.data.train, path.parent, config.data.step)
+    return config, config.with_parameters(runs)
 
 
 def parse_candidates(path: str | Path) -> tuple[Config, dict[str, Candidate]]:

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from dfsm.config.yaml_text import read_yaml
 from dfsm.errors import DfsmError, near_matches
 
 Parsed = TypeVar("Parsed", bound=BaseModel)
@@ -53,16 +52,17 @@ def load_yaml(path: Path, advice: str) -> dict[str, Any]:
         hint = f"did you mean {inside[0]}?" if len(inside) == 1 else f"name one, or {advice}"
         raise DfsmError(f"{path} is a folder, a configuration file was expected: {hint}")
     try:
-        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DfsmError(f"{path} cannot be read ({error.strerror}): {advice}") from None
-    except MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else "?"
-        raise DfsmError(f"{path}, line {line}: not valid YAML ({error.problem})") from None
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise DfsmError(f"{path} is not valid YAML ({str(error).splitlines()[0]})") from None
-    except RecursionError:
-        raise DfsmError(f"{path} is nested too deeply for a configuration") from None
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None)
+        if reason is None:
+            raise DfsmError(f"{path} is not valid YAML ({error})") from None
+        raise DfsmError(f"{path} cannot be read ({reason}): {advice}") from None
+    try:
+        raw = read_yaml(text)
+    except DfsmError as error:
+        joint = "," if str(error).startswith("line") else ":"
+        raise DfsmError(f"{path}{joint} {error}") from None
     if not isinstance(raw, dict):
         raise DfsmError(f"{path} holds no keys; {advice}")
     return raw

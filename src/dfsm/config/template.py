@@ -6,23 +6,19 @@ from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 from ruamel.yaml import YAML
 
+from dfsm.config.proposal import propose
 from dfsm.core.files import check_file, write_file
+from dfsm.core.types import Array
 from dfsm.data.info import ChannelInfo, describe
 from dfsm.data.readers import read_all
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import printable
 
-# What wind engineers usually choose, in order of preference; only names that exist are proposed.
-_STATES = ("PtfmPitch", "GenSpeed", "RotSpeed")
-_CONTROLS = ("GenTq", "BldPitch1")
-_OUTPUTS = ("TwrBsFxt", "TwrBsMyt", "GenPwr")
-_WINDS = ("RotWind", "RtVAvgxh", "Wind1VelX")
-_WITH_WIND = ("RotShearV", "RotShearH", "Wave1Elev")
 # A start-up transient is dropped from runs that are clearly longer than it.
 _TRANSIENT = 100.0
-_HUB_HEIGHT = 150.0
 
 _TEXT = """\
 # dfsm configuration. Next: dfsm fit {name} -o model/
@@ -31,9 +27,10 @@ data:
   train:{train}
   start: {start}      # s; earlier samples (the start-up transient) are not used
   stop: null       # s
-  hub_height: {hub_height}   # m; a number adds the channel RtVAvgxhCorr to every run
-
-# Channels (unit, range over the first run{constant}):
+  step: {step}       # s; interval between samples of files that hold no time
+  slower: null     # hold or linear: channels with fewer samples than their table, or {{cmd: hold}}
+{hub_height}
+# Channels (unit, range over the first run{constant}; what each is taken for below, and why):
 {channels}
 
 signals:
@@ -41,35 +38,40 @@ signals:
   # instead of a derivative with rate: <channel> (and acceleration: <channel>).
   states:{states}
   controls: {controls}        # what an optimizer may choose
-  # Known signals that nobody chooses. None of them may hold a response of the turbine.{wind_note}
+  # Known signals that nobody chooses. None of them may hold a response of the system.{wind_note}
   disturbances: {disturbances}
-  # Disturbances computed from others: a rate, or a first-order lag of so many seconds, as in
-  # [{{source: Wave1Elev, kind: rate}}, {{source: RotWind, kind: lag, time_constant: 10}}]
-  features: []
-  parameters: {parameters}       # plant variables, constant within a run
+  # Disturbances computed from others: a rate, a first-order lag or a delay of so many seconds, as
+  # in [{{source: {example}, kind: rate}}, {{source: {example}, kind: lag, time_constant: 10}},
+  # {{source: {example}, kind: delay, seconds: 2}}]
+  features: {features}
+  # Plant variables, constant within a run: channels, or values of runs whose files hold none, as
+  # {{Ballast: {{run1.outb: 1.0, run2.outb: 1.2}}}} or the name of a CSV table.
+  parameters: {parameters}
   outputs: {outputs}
 
 derivatives:
   method: smoothing_spline     # or cubic_spline, as in the paper
-  # filters: {{GenSpeed: {{kind: low_pass, cutoff: 0.5}}}}
+  # filters: {{{state}: {{kind: low_pass, cutoff: 0.5}}}}
 
 linear:
 {linear}
 
-# Known physics in the linear fit: rotor, quadratic_drag, product; docs/method.md has an example.
+# Known physics in the linear fit: {terms}; docs/method.md has an example.
 terms: []
 
 corrective:
-  kind: mlp           # or rbf, rbf_incremental, gp, none; docs/method.md lists their keys
-  hidden: [20, 20]    # units per layer
+{corrective}
 
 gate: 0.01            # correct a row only if its residual exceeds this share of the signal
 azimuth: {azimuth}
-nonlinear_only: true  # also fit the nonlinear-only model, for the comparison in the report
+nonlinear_only: {nonlinear_only}  # also fit the nonlinear-only model, for comparison in the report
 # Refine the derivative fit on rollouts over the training runs (null is a whole run), with latent
-# states that remember the inputs, for instance
-# refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8, network: 16, decay: 3}}
-refine: null
+# states that remember the inputs. Most accuracy and most time are here, the more the more states,
+# linear.points and runs: windows up to 100 s and 5 steps take 25 s of a processor for nine states
+# and seven runs of 600 s, what follows far longer. No further step is begun after so many seconds:
+# refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8, network: 16, decay: 3,
+#          seconds: 600}}
+refine: {refine}
 seed: 0
 
 # Structures to try: dfsm compare {name} -o comparison/ ranks them, and the one above, on a share of
@@ -83,7 +85,7 @@ seed: 0
 """
 
 
-def write_config(files: Sequence[str], path: Path) -> None:
+def write_config(files: Sequence[str], path: Path, step: float | None = None) -> None:
     """Write a configuration for some runs.
 
     Parameters
@@ -92,51 +94,71 @@ def write_config(files: Sequence[str], path: Path) -> None:
         Result files or patterns; they become ``data.train``.
     path
         File to write; relative patterns are rewritten to start from its folder.
+    step
+        Interval between samples in s of files that hold no time.
 
     Raises
     ------
     DfsmError
         A file cannot be read, or `path` not written.
     """
-    runs = read_all(files)
+    runs = read_all(files, step=step)
     check_file(path, [r.source for r in runs])
-    text = fill(runs, _relative([r.source or r.name for r in runs], path.parent), path.name)
+    names = _relative([r.source or r.name for r in runs], path.parent)
+    text = fill(runs, names, path.name, step)
     with write_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def fill(runs: Sequence[Trajectory], train: Sequence[str], name: str) -> str:
+def fill(
+    runs: Sequence[Trajectory], train: Sequence[str], name: str, step: float | None = None
+) -> str:
     """Fill the template with channels that all runs share."""
     first = describe(runs[0])
     common = set(runs[0].names).intersection(*(r.names for r in runs))
     shared = {c.name: c for c in first.channels if c.name in common}
-    varying = {n: c for n, c in shared.items() if any(r[n].min() < r[n].max() for r in runs)}
+    varying = {n: c for n, c in shared.items() if any(_varies(r[n]) for r in runs)}
     parameters = [n for n in shared if n not in varying and _differs(n, runs)]
     listed = [c for n, c in shared.items() if n in varying or n in parameters]
-    wind = next((w for w in _WINDS if w in varying), None)
-    states = [s for s in _STATES if s in varying]
-    states = states[:-1] if {"GenSpeed", "RotSpeed"} <= set(states) else states
-    disturbances = ([wind] if wind else []) + [d for d in _WITH_WIND if d in varying]
+    proposed = propose(runs, list(varying), parameters)
+    wind, turbine = proposed.wind, proposed.turbine
     long = min(r.time[-1] for r in runs) > 2 * _TRANSIENT + runs[0].time[0]
-    relative = wind == "RtVAvgxh"
+    states = [s["name"] for s in proposed.states]
+    margin = _TURBINE_MARGIN if turbine else _MARGIN
+    linear = "  kind: LTI\n" + margin
+    if wind:
+        linear = _LPV.format(schedule=_flow(wind), margin=margin)
+    driving = [*proposed.disturbances, *proposed.controls]
     return _TEXT.format(
         name=printable(name),
         train=_block(train),
-        start=_TRANSIENT if long else "null",
-        hub_height="null",
+        start=_TRANSIENT if long and turbine else "null",
+        hub_height=_HUB_HEIGHT if turbine else "",
+        step="null" if step is None else f"{step:g}",
         constant="" if len(listed) == len(first.channels) else "; constant ones left out",
-        channels="\n".join(_comment(c) for c in listed),
-        states=_block([{"name": s, "order": 2} for s in states]),
-        controls=_flow([c for c in _CONTROLS if c in varying]),
-        wind_note=_WIND_NOTE if relative else "",
-        disturbances=_flow(disturbances),
-        parameters=_flow(parameters),
-        outputs=_flow([o for o in _OUTPUTS if o in varying]),
-        linear=(
-            _LPV.format(schedule=_flow(wind), margin=_MARGIN) if wind else "  kind: LTI\n" + _MARGIN
-        ),
-        azimuth=_azimuth(states, varying),
+        channels="\n".join(_comment(c, proposed.reasons.get(c.name, "")) for c in listed),
+        states=_block(proposed.states),
+        controls=_flow(proposed.controls),
+        wind_note=_WIND_NOTE if wind == "RtVAvgxh" else "",
+        disturbances=_flow(proposed.disturbances),
+        features=_flow(proposed.features),
+        example=printable(driving[0] if driving else "<channel>"),
+        state=printable(states[0] if states else "<state>"),
+        terms="rotor, quadratic_drag, product" if turbine else "quadratic_drag, product",
+        parameters=_flow(proposed.parameters),
+        outputs=_flow(proposed.outputs),
+        linear=linear,
+        corrective=_NO_CORRECTION if turbine else _CORRECTION,
+        azimuth=_azimuth(states, varying, turbine),
+        nonlinear_only="false" if turbine else "true",
+        refine=_REFINE if turbine and long and len(runs) > 1 else "null",
     )
+
+
+def _varies(values: Array) -> bool:
+    """Whether a channel moves; one with fewer samples than its table may."""
+    finite = values[np.isfinite(values)]
+    return len(finite) > 0 and bool(finite.min() < finite.max())
 
 
 def _differs(name: str, runs: Sequence[Trajectory]) -> bool:
@@ -150,6 +172,20 @@ _WIND_NOTE = """
   # undisturbed rotor average of the wind field if you have it, or set data.hub_height and
   # replace RtVAvgxh by RtVAvgxhCorr here and in linear.schedule."""
 
+_HUB_HEIGHT = """\
+  hub_height: null   # m; a number adds the channel RtVAvgxhCorr to every run
+"""
+
+_CORRECTION = """\
+  kind: mlp           # or rbf, rbf_incremental, gp, none; docs/method.md lists their keys
+  hidden: [20, 20]    # units per layer"""
+
+_NO_CORRECTION = """\
+  kind: none          # what a turbine's residuals hold is mostly what no input tells; mlp, rbf or
+                      # gp learn from them, in minutes more"""
+
+_REFINE = "{windows: [20, 100], step: 0.25, iterations: 5, seconds: 90}"
+
 _LPV = """\
   kind: LPV           # LPV varies with the schedule; LTI does not (remove schedule, points)
   schedule: {schedule}
@@ -160,8 +196,14 @@ _MARGIN = """\
   margin: null        # 1/s; a number keeps all eigenvalues left of -margin, at the least cost in
                       # fit quality (not for a system that is truly unstable)"""
 
+_TURBINE_MARGIN = """\
+  margin: 0.01        # 1/s; keeps all eigenvalues left of -0.01, at the least cost in fit quality,
+                      # which the fit tells; without it rollouts of missing damping drift off"""
 
-def _azimuth(states: Sequence[str], varying: dict[str, ChannelInfo]) -> str:
+
+def _azimuth(states: Sequence[str], varying: dict[str, ChannelInfo], turbine: bool) -> str:
+    if not turbine:
+        return "null"
     speed = next((s for s in ("RotSpeed", "GenSpeed") if s in states), None)
     if speed is None or "LSSTipPxa" not in varying:
         return "null         # {speed: <state>, angle: <channel>} adds blade-passing (3P) inputs"
@@ -171,10 +213,11 @@ def _azimuth(states: Sequence[str], varying: dict[str, ChannelInfo]) -> str:
     )
 
 
-def _comment(channel: ChannelInfo) -> str:
+def _comment(channel: ChannelInfo, reason: str) -> str:
     # A line break in a name must not end the comment.
     name, unit = printable(channel.name), printable(channel.unit)
-    return f"#   {name:<16} {unit:<10} {channel.min:.5g} to {channel.max:.5g}"
+    line = f"#   {name:<16} {unit:<10} {channel.min:.5g} to {channel.max:.5g}"
+    return f"{line:<60}  {printable(reason)}" if reason else line
 
 
 def _block(items: Sequence[object]) -> str:

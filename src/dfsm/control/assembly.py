@@ -8,7 +8,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from dfsm.control.diagnose import conflict, require_finite, worst_violation
+from dfsm.control.chatter import chattering
+from dfsm.control.diagnose import conflict, require_finite, runaway, worst_violation
 from dfsm.control.guess import Start
 from dfsm.control.meshes import Record
 from dfsm.control.nlp.ipopt import Outcome
@@ -28,6 +29,8 @@ _ENDINGS = {
     "stalled": Ending.STALLED,
     "infeasible": Ending.INFEASIBLE,
     "limit": Ending.LIMIT,
+    "time": Ending.TIME,
+    "unbounded": Ending.UNBOUNDED,
     "interrupted": Ending.INTERRUPTED,
     "not finite": Ending.NOT_FINITE,
     "failed": Ending.FAILED,
@@ -35,6 +38,8 @@ _ENDINGS = {
 
 # Endings before the tolerance is met: they count only as far as the measured conditions hold.
 _EARLY = (Ending.ACCEPTABLE, Ending.STALLED)
+# Endings at which the conditions hold at the nodes: the replay shows what that is worth.
+_UNTRUE = (Ending.COARSE, Ending.CHATTERING)
 
 
 def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) -> Solution:
@@ -51,18 +56,19 @@ def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) 
     """
     shot, outcome, start = record.shot, record.outcome, record.start
     program, z = shot.program, outcome.z
-    ending = _ending(record)
+    chatter = chattering(shot, outcome, start)
+    ending = _ending(record, chatter)
     final_cost = float(program.blocks[1].c @ program.outputs(z)[1].ravel())
     objective = program.cost(z)
     trajectories = _trajectories(problem, shot.grid.tau, start)
     replays = ()
-    if simulate and ending.solved:
+    if simulate and (ending.solved or ending in _UNTRUE):
         count = range(len(problem.scenarios))
         replays = tuple(replay(problem, shot.grid, start, k) for k in count)
     return Solution(
         name=problem.name,
         ending=ending,
-        reason=_reason(shot, outcome, ending),
+        reason=_reason(record, ending, chatter),
         objective=objective,
         final_cost=final_cost,
         integral_cost=objective - final_cost,
@@ -82,21 +88,32 @@ def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) 
         bounds=_bounds(shot, trajectories[0].time),
         solver_state=outcome.multipliers,
         optimality=outcome.optimality,
+        errors=record.estimate.errors,
     )
 
 
-def _ending(record: Record) -> Ending:
+def _ending(record: Record, chatter: str) -> Ending:
     """What the solver says, as far as the measured optimality conditions bear it out."""
     ending, measured = _ENDINGS[record.outcome.ending], record.outcome.optimality
-    if ending is Ending.SOLVED and record.coarse:
-        return Ending.COARSE
     if ending in _EARLY and not measured.held(record.tolerance):
         return Ending.INACCURATE
-    return ending
+    if ending.solved and chatter and record.refines:
+        return Ending.CHATTERING
+    return Ending.COARSE if ending.solved and record.coarse else ending
 
 
-def _reason(shot: Shot, outcome: Outcome, ending: Ending) -> str:
+def _reason(record: Record, ending: Ending, chatter: str) -> str:
+    shot, outcome = record.shot, record.outcome
     program, z, measured = shot.program, outcome.z, outcome.optimality
+    if ending is Ending.CHATTERING:
+        return chatter
+    if ending is Ending.SOLVED and chatter:
+        # On a mesh that is to stay as it is, errors between the nodes are told and no more.
+        return f"{chatter}, which the cost cannot tell from its mean: scheme radau follows the arc"
+    if ending is Ending.COARSE:
+        return _coarse(record)
+    if ending is Ending.UNBOUNDED:
+        return runaway(program, z)
     if ending in _EARLY:
         return f"the optimality conditions hold to {measured.worst:.2g}"
     if ending is Ending.INACCURATE:
@@ -111,6 +128,20 @@ def _reason(shot: Shot, outcome: Outcome, ending: Ending) -> str:
         except DfsmError as error:
             return str(error).split(": give a guess")[0]
     return conflict(program, z)
+
+
+def _coarse(record: Record) -> str:
+    """Which error is too large, where, and why it was not lowered."""
+    kind, error = record.estimate.largest
+    local = getattr(record.estimate, kind)
+    k = int(np.argmax(local))
+    grid, start = record.shot.grid, record.start
+    middle = (grid.edges[k] + grid.edges[k + 1]) / 2
+    time = record.shot.problem.start + middle * (start.stop - record.shot.problem.start)
+    text = f"the error of the {kind} is {error:.2g}, most of it near {time:.4g} s"
+    if kind == "constraints" and record.estimate.exceeded:
+        text = f"between the nodes {record.estimate.exceeded}"
+    return f"{text}; {record.why}" if record.why else text
 
 
 def _multipliers(program: Program, outcome: Outcome) -> dict[str, Array]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from dfsm.control.flown import commands_told
 from dfsm.control.solution import RATE, Solution
 from dfsm.core.files import json_value
 from dfsm.core.settings import require
 from dfsm.core.types import Array
-from dfsm.core.units import POWERS, SPEEDS, TORQUES, plain
+from dfsm.core.units import factor
+from dfsm.data.conversion import in_units_of, tell_converted
 from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError, missing, printable
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
@@ -20,6 +22,14 @@ from dfsm.validation.results import ChannelError
 
 # Limits count as kept within this part of their size.
 _SLACK = 1e-6
+# The channel of the electrical power, and the torques and speeds of one shaft, as OpenFAST names
+# them: units do not tell a fast shaft from a slow one.
+_GENERATOR = "GenPwr"
+_SHAFTS = (
+    ({"GenTq", "HSShftTq"}, {"GenSpeed", "HSShftV"}),
+    ({"RotTorq", "LSShftTq", "RtAeroMxh"}, {"RotSpeed", "LSSTipVxa", "LSSTipV"}),
+)
+_RESPONSES = ("state", "output")
 
 
 @dataclass(frozen=True)
@@ -98,15 +108,20 @@ class RunCheck:
     complete
         Whether that is the whole horizon.
     power
-        Mean power in kW, ``predicted`` and ``actual``; None where no channel tells it.
+        Mean power in kW, ``predicted`` and ``actual``, either None where no channel tells it.
     power_source
-        The channels that tell the power.
+        The channels that tell the power, of the prediction and of the run if these differ.
     limits
         By channel, ``"rate of …"`` for rates; bounds without a channel in the run are left out.
     channels
         By name, in the solution's order.
     missing
         Channels of the solution that the run lacks.
+    power_advice
+        What to do where the power is not predicted; else "".
+    commands
+        Of every control that was flown otherwise than commanded: by how much, and why, a sentence
+        each. Where there is one, other differences say little about the model.
     """
 
     name: str
@@ -114,18 +129,22 @@ class RunCheck:
     start: float
     stop: float
     complete: bool
-    power: Mapping[str, float] | None
+    power: Mapping[str, float | None] | None
     power_source: str
     limits: Mapping[str, LimitCheck]
     channels: Mapping[str, ChannelCheck]
     missing: tuple[str, ...]
+    power_advice: str = ""
+    commands: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; None where not finite."""
         return dict(json_value({"format": 1, **asdict(self)}))
 
 
-def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunCheck:
+def check_run(
+    solution: Solution, run: Trajectory, scenario: int = 1, ratio: float | None = None
+) -> RunCheck:
     """Compare a run of the true system under the optimal controls with the prediction.
 
     Parameters
@@ -137,6 +156,9 @@ def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunChec
         that it lacks are left out and listed.
     scenario
         The one whose controls were used, counted from 1.
+    ratio
+        Speed of the torque's shaft over that of the speed's channel: with it the mean power is
+        computed from the only torque and the only speed, whatever they are called.
 
     Returns
     -------
@@ -145,8 +167,13 @@ def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunChec
     Raises
     ------
     DfsmError
-        Run and horizon have no time in common, the run has none of the channels, one in another
-        unit, or samples that are not finite.
+        Run and horizon have no time in common, the run has none of the channels, one in a unit of
+        something else, or samples that are not finite.
+
+    Warns
+    -----
+    DfsmWarning
+        Channels were converted to the solution's units.
     """
     count = len(solution.trajectories)
     require(1 <= scenario <= count, "scenario", scenario, f"1 to {count}")
@@ -155,11 +182,14 @@ def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunChec
     absent = tuple(c.name for c in full.channels if c.name not in run and c.role != "parameter")
     if not kept:
         raise DfsmError(f"{run.where}: {missing(absent, run.names)}")
-    _check_units(full, run, kept)
-    actual = _common(full, run).select(kept).require_finite()
-    predicted = _prediction(solution, scenario - 1, actual.time).select(kept)
+    require(ratio is None or ratio > 0, "ratio", ratio, "a number above 0")
+    common = in_units_of(_common(full, run), full.channels, "the solution")
+    tell_converted([run], [common])
+    actual = common.select(kept).require_finite()
+    whole = _prediction(solution, scenario - 1, actual.time)
+    predicted = whole.select(kept)
     slack = 1e-6 * full.duration
-    power, source = _power(predicted, actual)
+    power, source, advice = _power(whole, common, ratio)
     return RunCheck(
         name=solution.name,
         run=run.where,
@@ -173,17 +203,9 @@ def check_run(solution: Solution, run: Trajectory, scenario: int = 1) -> RunChec
         limits=_limits(solution, full.time, predicted, actual),
         channels={name: _channel(predicted, actual, name) for name in kept},
         missing=absent,
+        power_advice=advice,
+        commands=commands_told(predicted, actual),
     )
-
-
-def _check_units(full: Trajectory, run: Trajectory, names: Sequence[str]) -> None:
-    for name in names:
-        ours, theirs = full.channel(name).unit, run.channel(name).unit
-        if plain(ours) != plain(theirs):
-            raise DfsmError(
-                f"{run.where}: '{name}' is in '{theirs}', in the solution in '{ours}': convert one "
-                "of them"
-            )
 
 
 def _common(full: Trajectory, run: Trajectory) -> Trajectory:
@@ -271,24 +293,60 @@ def _between(time: Array, nodes: Array, limit: Array) -> Array:
     return limit[np.clip(np.searchsorted(nodes, time), 0, len(nodes) - 1)]
 
 
-def _power(predicted: Trajectory, actual: Trajectory) -> tuple[dict[str, float] | None, str]:
-    """Mean power in kW: of a channel that holds it, else of the only torque and the only speed."""
+def _power(
+    predicted: Trajectory, actual: Trajectory, ratio: float | None
+) -> tuple[dict[str, float | None] | None, str, str]:
+    """Mean power in kW predicted and of the run, what tells it, and what to do where nothing does.
 
-    def of(units: Mapping[str, float], group: tuple[Role, ...]) -> list[tuple[str, float]]:
-        chosen = [c for c in predicted.channels if plain(c.unit) in units and c.role in group]
-        return [(c.name, units[plain(c.unit)]) for c in chosen]
+    `predicted` and `actual` hold all channels of the solution and of the run.
+    """
+    factors, advice = _factors(predicted, ratio)
+    named = _power_channel(actual, next(iter(factors)) if len(factors) == 1 else "")
+    came = named or (factors if all(name in actual for name in factors) else {})
+    if not came:
+        return None, "", advice
 
-    factors = of(POWERS, ("output", "state"))[:1]
-    if not factors:
-        torques = of(TORQUES, ("control",))
-        speeds = of({"rpm": SPEEDS["rpm"]}, ("state", "output"))
-        if len(torques) != 1 or len(speeds) != 1:
-            return None, ""
-        factors = [torques[0], (speeds[0][0], speeds[0][1] / 1000)]
-
-    def mean(run: Trajectory) -> float:
-        power = np.prod([factor * run[name] for name, factor in factors], axis=0)
+    def mean(run: Trajectory, factors: Mapping[str, float]) -> float | None:
+        if not factors:
+            return None
+        run = run.select(factors).require_finite()
+        power = np.prod([size * run[name] for name, size in factors.items()], axis=0)
         return float(np.trapezoid(power, run.time)) / run.duration
 
-    source = " × ".join(printable(name) for name, _ in factors)
-    return {"predicted": mean(predicted), "actual": mean(actual)}, source
+    told = (" × ".join(printable(name) for name in f) for f in (factors, came))
+    source = " → ".join(dict.fromkeys(text for text in told if text))
+    return {"predicted": mean(predicted, factors), "actual": mean(actual, came)}, source, advice
+
+
+def _factors(run: Trajectory, ratio: float | None) -> tuple[dict[str, float], str]:
+    """Channels whose product is the power, with their sizes in kW, kN m and rad/s, and advice."""
+    if named := _power_channel(run):
+        return named, ""
+    torques = [c.name for c in run.channels if factor(c.unit, "kN m") and c.role == "control"]
+    speeds = [c.name for c in run.channels if factor(c.unit, "rad/s") and c.role in _RESPONSES]
+    sizes = {n: factor(run.channel(n).unit, "kN m") or 0.0 for n in torques} | {
+        n: factor(run.channel(n).unit, "rad/s") or 0.0 for n in speeds
+    }
+    for shaft in _SHAFTS:
+        pairs = [(t, s) for t in torques for s in speeds if t in shaft[0] and s in shaft[1]]
+        if len(pairs) == 1:
+            return {name: sizes[name] for name in pairs[0]}, ""
+    if len(torques) != 1 or len(speeds) != 1:
+        return {}, ""
+    torque, speed = torques[0], speeds[0]
+    if ratio is not None:
+        return {torque: sizes[torque], speed: ratio * sizes[speed]}, ""
+    return {}, (
+        f"no power is predicted from {torque} and {speed}, which may belong to different shafts: "
+        "give the gearbox ratio between them with --ratio, 1 for one shaft"
+    )
+
+
+def _power_channel(run: Trajectory, name: str = "") -> dict[str, float]:
+    """The channel that holds the power: this one, the generator's, or the only one there is."""
+    sizes = {c.name: factor(c.unit, "kW") for c in run.channels if c.role != "control"}
+    known = {n: size for n, size in sizes.items() if size is not None}
+    for wanted in (name, _GENERATOR):
+        if wanted in known:
+            return {wanted: known[wanted]}
+    return known if len(known) == 1 else {}

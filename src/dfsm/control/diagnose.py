@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dfsm.control.nlp.program import Program
+from dfsm.control.nlp.program import Program, Rows
 from dfsm.control.nlp.watch import violation
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
@@ -42,11 +42,41 @@ def conflict(program: Program, z: Array) -> str:
         if not len(rows.index) or amount[rows.index].max() <= 1e-6:
             continue
         k = int(np.argmax(amount[rows.index]))
-        size = amount[rows.index][k] * program.row_scale[rows.index[k]]
+        size = amount[rows.index][k] * _unit(program, rows)[k]
         told.append(f"{rows.name} misses by {size:.3g}{_when(rows.times[k])}")
-    held = _held(program, z)
+    held, limits = _held(program, z), _limiting(program, z)
     text = ", ".join(told) or "all constraints are met"
+    text += f"; at their limits are {', '.join(limits)}" if limits else ""
     return text + (f"; at their bounds are {', '.join(held)}" if held else "")
+
+
+def _unit(program: Program, rows: Rows) -> Array:
+    """What scaled values of rows are multiplied by to be in the unit of their name."""
+    unit = program.row_scale[rows.index]
+    return unit if rows.per is None else unit / rows.per
+
+
+def _limiting(program: Program, z: Array) -> list[str]:
+    """Rates, path and boundary constraints that are at a limit, or beyond."""
+    g, by_name = program.constraints(z), {}
+    for rows in program.rows:
+        value, low, high = (a[rows.index] for a in (g, program.g_lower, program.g_upper))
+        for limit, side, beyond in ((low, "lower", low - value), (high, "upper", value - high)):
+            met = (low < high) & np.isfinite(limit) & (beyond > -_AT_BOUND)
+            if met.any():
+                number = (limit * _unit(program, rows))[met][0]
+                told = f"{rows.name} ({side} limit {number:.4g})"
+                by_name[told] = max(by_name.get(told, 0.0), float(met.mean()))
+    ranked = sorted(by_name.items(), key=lambda pair: -pair[1])[:_MOST]
+    return [f"{told} for {share:.0%} of the time" for told, share in ranked]
+
+
+def runaway(program: Program, z: Array) -> str:
+    """Say which variable ran away, and in which direction."""
+    sizes = [(np.abs(z[r.index]).max(initial=0.0), r) for r in program.variables]
+    _, rows = max(sizes, key=lambda pair: pair[0])
+    k = rows.index[int(np.argmax(np.abs(z[rows.index])))]
+    return f"{rows.name} runs away to {program.physical(z)[k]:.3g}"
 
 
 def _held(program: Program, z: Array) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Solution
 from dfsm.core.types import Array
+from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 
@@ -25,12 +26,15 @@ class Start:
         Free parameters, shape ``(parameter,)``.
     stop
         Last time in s.
+    sizes
+        What a coarser mesh divided states and controls by; None before there is one.
     """
 
     X: Array
     U: Array
     p: Array
     stop: float
+    sizes: tuple[Array, Array] | None = None
 
 
 def start_of(
@@ -83,6 +87,8 @@ def _take_solution(
 def _take_run(
     problem: OptimalControlProblem, guess: Trajectory, tau: Array, X: Array, U: Array
 ) -> None:
+    channels = [*problem.plant.channels["states"], *problem.plant.channels["controls"]]
+    guess = in_units_of(guess, channels)
     time = guess.time[0] + tau * guess.duration
     taken = 0
     for group, values in (("states", X), ("controls", U)):

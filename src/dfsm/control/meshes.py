@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,10 @@ import numpy as np
 
 from dfsm.control.diagnose import require_finite, worst_violation
 from dfsm.control.guess import Start, start_of
+from dfsm.control.mesh.grid import Grid
+from dfsm.control.nlp.estimate import Estimate
 from dfsm.control.nlp.ipopt import Outcome, SolverSettings, solve_nlp
+from dfsm.control.nlp.knots import knots_of
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.shot import Method, Shot
 from dfsm.control.problem import OptimalControlProblem
@@ -28,6 +32,13 @@ _NEAR = 1e-2
 _ROUGHLY = 1e-4
 # Meshes are not refined beyond this many intervals.
 _MOST_INTERVALS = 5000
+# So many meshes must together lower the largest error by this factor.
+_PATIENCE, _LESS = 3, 0.7
+# Endings that a mesh may owe to being too coarse; it is then cut so finely, up to so many starts,
+# unless it has more than so many intervals.
+_NOT_SO_FINE = ("infeasible", "failed")
+_FINER, _STARTS, _MOST_COARSE = 3, 3, 300
+_OUT_OF_TIME = "the time limit came before a finer mesh was solved"
 
 
 class Record:
@@ -38,7 +49,13 @@ class Record:
     shot, outcome, start
         The last mesh's program, how the solver ended on it, and the values at its nodes.
     error, coarse
-        Its largest local error, and whether that is above what was asked.
+        Its largest local error of the dynamics, and whether any error is above what was asked.
+    estimate
+        All errors on the last mesh.
+    refines
+        Whether errors between the nodes were to meet anything.
+    why
+        Why no finer mesh was tried although one was asked for; else "".
     tolerance, objective_scale
         Of the solver, and of the objective that it saw.
     meshes, iterations, compile, solve
@@ -50,13 +67,15 @@ class Record:
         self.compile = self.solve = 0.0
         self.meshes: list[dict[str, Any]] = []
         self.iterations = 0
-        self.coarse = False
+        self.coarse = self.refines = False
+        self.why = ""
         self.objective_scale = 1.0
 
-    def add(self, shot: Shot, outcome: Outcome, start: Start, error: float) -> None:
+    def add(self, shot: Shot, outcome: Outcome, start: Start, estimate: Estimate) -> None:
         """Keep one mesh."""
-        self.start = start
-        self.shot, self.outcome, self.error = shot, outcome, error
+        self.start, self.estimate = start, estimate
+        self.error = estimate.errors["dynamics"]
+        self.shot, self.outcome = shot, outcome
         self.objective_scale = shot.program.objective_scale
         self.solve += outcome.seconds
         self.iterations += outcome.iterations
@@ -64,10 +83,16 @@ class Record:
             {
                 "intervals": shot.grid.intervals,
                 "objective": shot.program.cost(outcome.z),
-                "error": error,
+                "error": self.error,
+                "errors": estimate.errors,
                 "iterations": outcome.iterations,
             }
         )
+
+    def go_back(self, shot: Shot, outcome: Outcome, start: Start, estimate: Estimate) -> None:
+        """Let an earlier mesh be the last one; what the later ones took still counts."""
+        self.shot, self.outcome, self.start, self.estimate = shot, outcome, start, estimate
+        self.error = estimate.errors["dynamics"]
 
     def after(self, other: Record | None) -> Record:
         """Itself, with the meshes of another counted before its own."""
@@ -101,40 +126,111 @@ def solve_meshes(
     Record
         What the last mesh came to, and what all took.
     """
-    grid = method.grid()
+    until = None if method.most_seconds is None else clock.perf_counter() + method.most_seconds
+    tolerance = max(method.tolerance, _ROUGHLY) if on_the_way else method.tolerance
+    settings = SolverSettings(tolerance, method.most_iterations, until=until)
+    refine = None if on_the_way else method.refine
+    record, grid = Record(tolerance), method.grid()
+    record = _from_guess(record, problem, method, grid, guess, settings)
+    if refine is None:
+        return record
+    record.refines = True
+    for _ in range(_STARTS - 1):
+        if record.outcome.ending not in _NOT_SO_FINE or grid.intervals > _MOST_COARSE:
+            break
+        grid = grid.finer(_FINER)
+        record = _from_guess(record, problem, method, grid, guess, settings)
+    return _refined(record, problem, method, refine, settings)
+
+
+def _from_guess(
+    record: Record,
+    problem: OptimalControlProblem,
+    method: Method,
+    grid: Grid,
+    guess: Solution | Trajectory | None,
+    settings: SolverSettings,
+) -> Record:
+    """Solve on a mesh from what the user gave."""
     start = start_of(problem, guess, grid.tau)
-    near, multipliers = isinstance(guess, Solution), None
+    multipliers = None
     if isinstance(guess, Solution) and np.array_equal(guess.grid.edges, grid.edges):
         multipliers = guess.solver_state
-    tolerance = max(method.tolerance, _ROUGHLY) if on_the_way else method.tolerance
-    record = Record(tolerance)
-    refine, rounds = None if on_the_way else method.refine, method.most_refinements
-    for round_ in range(rounds + 1):
-        begin = clock.perf_counter()
-        shot = method.shot(problem, grid, start)
-        shot.program.objective_scale = record.objective_scale
-        z = shot.scaled(start)
-        _prepare(shot, z)
-        warm = near and _is_near(shot, start)
-        record.compile += clock.perf_counter() - begin
-        settings = SolverSettings(tolerance, method.most_iterations, warm)
-        outcome = _solve_scaled(shot.program, z, settings, multipliers if warm else None)
-        start = shot.unscaled(outcome.z)
-        errors = shot.errors(start)
-        record.add(shot, outcome, start, float(errors.max()))
-        if refine is None or errors.max() <= refine or grid.intervals > _MOST_INTERVALS:
-            break
-        if round_ == rounds or outcome.ending not in _GOOD:
-            break
-        old, grid = grid, grid.refined(errors, refine)
-        start = replace(
-            start,
-            X=np.stack([old.states(X, grid.tau) for X in start.X]),
-            U=np.stack([old.controls(U, grid.tau) for U in start.U]),
-        )
-        near, multipliers = True, None
-    record.coarse = refine is not None and not record.error <= refine
+    settings = replace(settings, warm=isinstance(guess, Solution))
+    return _on(record, method.shot(problem, grid, start), start, settings, multipliers)
+
+
+def _on(
+    record: Record,
+    shot: Shot,
+    start: Start,
+    settings: SolverSettings,
+    multipliers: Array | None = None,
+) -> Record:
+    """Solve on one mesh, near the start where the settings say so and it is near a solution."""
+    begin = clock.perf_counter()
+    shot.program.objective_scale = record.objective_scale
+    z = shot.scaled(start)
+    _prepare(shot, z)
+    warm = settings.warm and _is_near(shot, start)
+    record.compile += clock.perf_counter() - begin
+    outcome = _solve_scaled(
+        shot.program, z, replace(settings, warm=warm), multipliers if warm else None
+    )
+    start = shot.unscaled(outcome.z)
+    record.add(shot, outcome, start, shot.estimate(outcome, start))
     return record
+
+
+def _refined(
+    record: Record,
+    problem: OptimalControlProblem,
+    method: Method,
+    refine: float,
+    settings: SolverSettings,
+) -> Record:
+    """Cut intervals, and solve again, until all errors are below what was asked."""
+    history, knots = [record.estimate.largest], None
+    for round_ in range(method.most_refinements + 1):
+        grid = record.shot.grid
+        if record.outcome.ending not in _GOOD or history[-1][1] <= refine:
+            break
+        record.why = _hopeless(history, grid.intervals, settings.until)
+        if record.why or round_ == method.most_refinements:
+            break
+        knots = knots_of(problem, record.shot.functions) if knots is None else knots
+        finer = grid.refined(record.estimate.local(refine), refine, knots)
+        start = replace(
+            record.start,
+            X=np.stack([grid.states(X, finer.tau) for X in record.start.X]),
+            U=np.stack([grid.controls(U, finer.tau) for U in record.start.U]),
+            sizes=record.shot.layout.sizes(record.shot.program.scale),
+        )
+        before = (record.shot, record.outcome, record.start, record.estimate)
+        shot = method.shot(problem, finer, start)
+        record = _on(record, shot, start, replace(settings, warm=True))
+        if record.outcome.ending == "time":
+            # What was solved on the mesh before is worth more than what was begun.
+            record.go_back(*before)
+            record.why = _OUT_OF_TIME
+            break
+        history.append(record.estimate.largest)
+    record.coarse = not record.estimate.largest[1] <= refine
+    return record
+
+
+def _hopeless(history: Sequence[tuple[str, float]], intervals: int, until: float | None) -> str:
+    """Why no finer mesh is worth trying, "" while one is."""
+    if until is not None and clock.perf_counter() > until:
+        return _OUT_OF_TIME
+    if intervals > _MOST_INTERVALS:
+        return f"{intervals} intervals are the most that are tried"
+    if len(history) > _PATIENCE and history[-1][1] > _LESS * history[-1 - _PATIENCE][1]:
+        kind, error = history[-1]
+        return (
+            f"{_PATIENCE} finer meshes did not lower the largest error, {error:.2g} of the {kind}"
+        )
+    return ""
 
 
 def _is_near(shot: Shot, start: Start) -> bool:
@@ -163,9 +259,11 @@ def _solve_scaled(
     """
     scale = program.objective_scale
     first = _solve_once(program, z, settings, multipliers)
-    if settings.warm and first.ending not in (*_GOOD, "interrupted"):
+    if settings.warm and first.ending not in (*_GOOD, "interrupted", "time"):
         # What looked close was not: start afresh from the same point.
         first = _solve_once(program, z, replace(settings, warm=False), None)
+    if first.ending == "failed" and program.linear_quadratic:
+        first = _solve_once(program, z, replace(settings, warm=False, adaptive=False), None)
     if first.ending not in _GOOD:
         return first
     variation = program.variation(first.z)

@@ -13,7 +13,10 @@ from typing import Any
 import jax.numpy as jnp
 
 import dfsm.core.jax_setup  # noqa: F401
-from dfsm.data.trajectory import Channel
+from dfsm.data.conversion import in_units_of
+from dfsm.data.derivatives import per_second
+from dfsm.data.features import acting_late
+from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.dfsm import DFSM
 from dfsm.models.inputs import InputOrder
@@ -54,6 +57,29 @@ class Plant:
         """Names of one group, e.g. ``names("states")``."""
         return tuple(c.name for c in self.channels[group])
 
+    def in_its_units(self, limits: Mapping[str, Any], kind: str) -> dict[str, Any]:
+        """Pairs of limits by channel, with those that a run holds in this plant's units.
+
+        Parameters
+        ----------
+        limits
+            By name; what is no run passes as it is.
+        kind
+            ``"bounds"``, or ``"rates"``, which are per second.
+        """
+        units = {c.name: c.unit for group in self.channels.values() for c in group}
+
+        def taken(name: str, limit: Any) -> Any:
+            if not isinstance(limit, Trajectory):
+                return limit
+            unit = per_second(units[name]) if kind == "rates" else units[name]
+            return in_units_of(limit, [Channel(name, unit)])
+
+        return {
+            name: tuple(taken(name, limit) for limit in pair) if isinstance(pair, tuple) else pair
+            for name, pair in limits.items()
+        }
+
     @property
     def order(self) -> InputOrder:
         """Where everything stands in I = [u, w, ξ, p], which `region` is about."""
@@ -70,9 +96,10 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
     Raises
     ------
     DfsmError
-        The model is something else, or JAX cannot follow it.
+        The model is something else, JAX cannot follow it, or a control acts late in it.
     """
     if isinstance(model, DFSM):
+        _require_prompt_controls(model)
         channels = {g: tuple(getattr(model.signals, g)) for g in GROUPS.values()}
         ready = model.prepared()
         return Plant(channels, ready.derivative, ready.output, model.region)
@@ -88,6 +115,17 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
         )
     channels = {g: tuple(getattr(model, g)) for g in GROUPS.values()}
     return Plant(channels, _AsArray(model.f), _AsArray(model.g), None)
+
+
+def _require_prompt_controls(model: DFSM) -> None:
+    late = acting_late(model.signals.features, model.signals.names("controls"))
+    if late:
+        feature, control = next(iter(late.items()))
+        raise DfsmError(
+            f"'{feature}' is what the control '{control}' did some time ago, which optimal control "
+            "cannot follow while it chooses it: fit a model without this feature (states of a "
+            "filter stand in for a delay), or one whose delays are of disturbances"
+        )
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ import numpy as np
 from dfsm.control.names import GROUPS, Plant, plant_of
 from dfsm.core.settings import require
 from dfsm.core.types import Array
+from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
+from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state, latents_at, poles
-from dfsm.models.signals import with_computed
 from dfsm.simulators import ODESystem
 
 # A number, None for no limit, a function of time (array in, array out), or a run with the channel.
@@ -98,6 +99,8 @@ class OptimalControlProblem:
 
     def __post_init__(self) -> None:
         _check_names(self)
+        for place in ("bounds", "rates"):
+            object.__setattr__(self, place, self.plant.in_its_units(getattr(self, place), place))
         _check_pairs(self)
         _check_horizon(self)
         _check_disturbances(self)
@@ -148,16 +151,15 @@ class OptimalControlProblem:
         """Disturbances of every scenario; a single None where there are none."""
         if self.disturbances is None:
             return (None,)
-        if isinstance(self.disturbances, Trajectory):
-            return (self._completed(self.disturbances),)
-        return tuple(self._completed(run) for run in self.disturbances)
+        runs = self.disturbances
+        return tuple(map(self._completed, [runs] if isinstance(runs, Trajectory) else runs))
 
     def _completed(self, run: Trajectory) -> Trajectory:
-        """Add the disturbances that a surrogate computes from others, where the run lacks any."""
-        names = self.plant.names("disturbances")
-        if not isinstance(self.model, DFSM) or all(n in run for n in names):
-            return run
-        return with_computed(run, self.model.signals.hub_height, self.model.signals.features)
+        """In the model's units, with disturbances computed from others where it lacks any."""
+        if isinstance(self.model, DFSM):
+            whole = all(n in run for n in self.plant.names("disturbances"))
+            return completed(run, self.model.signals, compute=not whole)
+        return in_units_of(run, [c for group in self.plant.channels.values() for c in group])
 
     @property
     def latents(self) -> tuple[str, ...]:
@@ -432,10 +434,8 @@ def _check_region(problem: OptimalControlProblem, time: Array) -> None:
     trained = np.stack([plant.region.low, plant.region.high], axis=1)
     for key in problem.bounds:
         if key in plant.order.names:
-            (below, above), (low, high) = (
-                problem.limits(key, time),
-                trained[plant.order.column(key)],
-            )
+            below, above = problem.limits(key, time)
+            low, high = trained[plant.order.column(key)]
             if (below > high).any() or (above < low).any():
                 at = int(np.argmax((below > high) | (above < low)))
                 raise DfsmError(

@@ -37,8 +37,12 @@ class Ending(enum.Enum):
         "functions, check the scaling of bounds and costs, or start from another guess"
     )
     COARSE = (
-        "solved on the last mesh, whose local error is still above what was asked: raise "
-        "most_refinements, or loosen refine"
+        "the optimality conditions hold on the last mesh, whose errors between the nodes are still "
+        "above what was asked: raise most_refinements, or loosen refine"
+    )
+    CHATTERING = (
+        "not solved, a control jumps to and fro from node to node where the cost cannot tell it "
+        "from its mean (a singular arc): use scheme radau, or add a small cost on the control"
     )
     INFEASIBLE = (
         "no feasible point was found: the constraints named here conflict, widen one of them or "
@@ -47,6 +51,14 @@ class Ending(enum.Enum):
     LIMIT = (
         "the iteration limit was reached, this is the best iterate: raise most_iterations, or "
         "start from a better guess"
+    )
+    TIME = (
+        "the time limit was reached, this is the best iterate: raise most_seconds, or solve again "
+        "with it as guess"
+    )
+    UNBOUNDED = (
+        "the objective falls without limit: bound the variables named here, or correct the sign of "
+        "the cost"
     )
     INTERRUPTED = "interrupted, this is the best iterate so far: solve again with it as guess"
     NOT_FINITE = (
@@ -60,12 +72,13 @@ class Ending(enum.Enum):
 
     @property
     def solved(self) -> bool:
-        """Whether the result satisfies the optimality conditions on its mesh.
+        """Whether the optimality conditions hold, and all errors meet what was asked.
 
-        `ACCEPTABLE` and `STALLED` are only told where the conditions were measured and hold to
-        1e-6, or to the tolerance if that is looser; else the ending is `INACCURATE`.
+        `COARSE` is none: errors between the nodes are above `refine`. `ACCEPTABLE` and `STALLED`
+        are only told where the conditions were measured and hold to 1e-6, or to the tolerance if
+        that is looser; else the ending is `INACCURATE`.
         """
-        return self in (Ending.SOLVED, Ending.ACCEPTABLE, Ending.STALLED, Ending.COARSE)
+        return self in (Ending.SOLVED, Ending.ACCEPTABLE, Ending.STALLED)
 
 
 @dataclass(frozen=True)
@@ -145,9 +158,9 @@ class Solution:
     grid
         The mesh and its scheme.
     error
-        Largest relative local error of an interval.
+        Largest relative local error of the dynamics of an interval, as in `errors`.
     meshes
-        Per mesh tried: ``intervals``, ``objective``, ``error``, ``iterations``.
+        Per mesh tried: ``intervals``, ``objective``, ``error``, ``errors``, ``iterations``.
     iterations
         Of the solver, on all meshes together.
     seconds
@@ -155,7 +168,7 @@ class Solution:
     linear_quadratic
         Whether the problem was recognised as linear-quadratic and solved as such.
     violation
-        Largest violation of a constraint, relative to its size.
+        Largest violation of a constraint at the nodes, relative to its size.
     outside
         Share of the horizon with any input outside the training range; None without a surrogate.
     replays
@@ -169,6 +182,13 @@ class Solution:
     optimality
         How well the optimality conditions hold at the result; None for a solution saved by a
         version that did not measure it.
+    errors
+        Estimated errors between the nodes by name, all relative: ``dynamics``, the worst interval's
+        ∫ |ẋ − f| dt over the size of a state; ``cost``, what the quadrature misses of ∫ L dt, over
+        ∫ |L| dt + |M|; ``constraints``, the largest excess over a limit, over its size (that
+        of a limit on controls, which may jump, is integrated over normalised time); ``objective``,
+        how far the objective is from the optimum, which these three make, over the same as the
+        cost. NaN without an estimate (shooting), empty for a solution of an earlier version.
     """
 
     name: str
@@ -193,6 +213,7 @@ class Solution:
     bounds: Mapping[str, Array] = field(default_factory=dict)
     solver_state: Array = field(default_factory=lambda: np.empty(0))
     optimality: Optimality | None = None
+    errors: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         t = self.trajectory
@@ -209,7 +230,7 @@ class Solution:
 
     @property
     def solved(self) -> bool:
-        """Whether the result satisfies the optimality conditions on its mesh."""
+        """Whether the optimality conditions hold, and all errors meet what was asked."""
         return self.ending.solved
 
     @property
@@ -248,6 +269,7 @@ class Solution:
             f"{self.integral_cost:.6g}), {span.time[0]:g} to {span.time[-1]:.8g} s",
             f"{self.grid.kind}, {self.grid.intervals} intervals, local error {self.error:.2g}, "
             f"largest violation {self.violation:.2g}",
+            *self._between(),
             f"{self.iterations} iterations, {self.seconds['compile']:.2f} s to compile, "
             f"{self.seconds['solve']:.2f} s to solve"
             + (", linear-quadratic" if self.linear_quadratic else ""),
@@ -274,6 +296,11 @@ class Solution:
         if self.outside is not None:
             lines.append(f"{self.outside:.1%} of the horizon outside the training range")
         return "\n".join(lines)
+
+    def _between(self) -> list[str]:
+        """What is known of the errors between the nodes."""
+        told = {k: v for k, v in self.errors.items() if np.isfinite(v)}
+        return [f"errors between the nodes: {_listed(told)}"] if told else []
 
 
 def _listed(values: Mapping[str, float]) -> str:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, TypeAdapter
 
 from dfsm.control.mesh.grid import Grid
-from dfsm.control.solution import Ending, Optimality, Replay, Solution
+from dfsm.control.solution import RATE, Ending, Optimality, Replay, Solution
 from dfsm.core.bundle import MANIFEST, Bundle
-from dfsm.core.files import check_folder
+from dfsm.core.exchange import recover
+from dfsm.core.files import check_folder, visible
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -41,7 +42,11 @@ _PLAIN = (
 )
 
 
-def save_solution(solution: Solution, path: str | Path) -> None:
+def save_solution(
+    solution: Solution,
+    path: str | Path,
+    page: Callable[[Solution, Path], object] | None = None,
+) -> None:
     """Write a solution folder; an existing solution folder there is replaced in one step.
 
     Parameters
@@ -50,6 +55,8 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         From `solve`.
     path
         Folder to make.
+    page
+        Writes a page about the solution to a file, which becomes part of the folder.
 
     Raises
     ------
@@ -72,9 +79,12 @@ def save_solution(solution: Solution, path: str | Path) -> None:
         "replays": _apart("replays", [r.trajectory for r in solution.replays], tensors),
         "deviations": [[dict(r.deviation), r.relative] for r in solution.replays],
     }
+    if solution.errors:
+        content["errors"] = dict(solution.errors)
     if solution.optimality is not None:
         content["optimality"] = asdict(solution.optimality)
-    _BUNDLE.write(path, tensors, content, _is_solution)
+    pages = {} if page is None else {PAGE: lambda file: page(solution, file)}
+    _BUNDLE.write(path, tensors, content, _is_solution, pages)
 
 
 def check_solution_target(path: str | Path) -> None:
@@ -96,21 +106,21 @@ def load_solution(path: str | Path) -> Solution:
         The folder is missing, no solution, damaged, or written by a newer version.
     """
     path = Path(path)
+    recover(path)
     if not path.is_dir() or not _is_solution(path):
         raise DfsmError(f"{path} is no folder of a solution as save_solution makes it")
     manifest = _BUNDLE.read_manifest(path)
     tensors = _BUNDLE.read_tensors(path, manifest)
     try:
         plain = {key: manifest[key] for key in _PLAIN}
-        # JSON has no NaN: a shooting method has no local error.
-        plain["error"] = np.nan if plain["error"] is None else plain["error"]
+        plain |= _Figures.model_validate(plain).model_dump()
         replays = [
             Replay(run, deviation, relative)
             for run, (deviation, relative) in zip(
-                _together("replays", manifest, tensors), manifest["deviations"], strict=True
+                _together("replays", manifest, tensors), _deviations(manifest), strict=True
             )
         ]
-        return Solution(
+        solution = Solution(
             **plain,
             ending=Ending[manifest["ending"]],
             grid=Grid(**manifest["scheme"], edges=tensors["edges"]),
@@ -121,11 +131,85 @@ def load_solution(path: str | Path) -> Solution:
             replays=tuple(replays),
             solver_state=tensors["solver_state"],
             optimality=_optimality(manifest),
+            errors=_numbers(manifest.get("errors", {})),
         )
-    except (KeyError, TypeError, ValueError, ValidationError) as error:
+        _check(solution)
+    except (*_GARBLED, DfsmError) as error:
         raise _BUNDLE.damaged(
             path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]
         ) from None
+    return solution
+
+
+# What Python and pydantic say of parts that do not fit together.
+_GARBLED = (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError)
+# JSON has no NaN: a shooting method has no local error, a solve that failed may have no objective.
+_Number = Annotated[float, BeforeValidator(lambda v: np.nan if v is None else v)]
+
+
+class _Mesh(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    intervals: int
+    objective: _Number
+    error: _Number
+    iterations: int
+
+
+class _Seconds(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    compile: float
+    solve: float
+
+
+class _Figures(BaseModel):
+    """Types of what the manifest holds as it is."""
+
+    name: str
+    reason: str
+    objective: _Number
+    final_cost: _Number
+    integral_cost: _Number
+    parameters: dict[str, float]
+    error: _Number
+    meshes: list[_Mesh]
+    iterations: int
+    seconds: _Seconds
+    linear_quadratic: bool
+    violation: _Number
+    outside: float | None
+
+
+def _deviations(manifest: Mapping[str, Any]) -> list[tuple[dict[str, float], float]]:
+    kind = TypeAdapter(list[tuple[dict[str, _Number], _Number]])
+    return kind.validate_python(manifest["deviations"])
+
+
+def _check(solution: Solution) -> None:
+    """Refuse a mesh that is not that of the trajectories, before its matrices are made.
+
+    Raises
+    ------
+    ValueError
+        Says which part.
+    """
+    grid, runs = solution.grid, solution.trajectories
+    steps = {"trapezoidal": 1, "hermite_simpson": 2, "radau": grid.degree}
+    if grid.kind not in steps or type(grid.degree) is not int or grid.degree < 1:
+        raise ValueError("scheme")
+    edges = grid.edges
+    if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
+        raise ValueError("edges, expected at least two that increase")
+    nodes = steps[grid.kind] * (len(edges) - 1) + 1
+    if not runs or any(len(run) != nodes for run in runs):
+        raise ValueError(f"scheme, whose {nodes} nodes are not those of the trajectories")
+    if any(len(group) not in (0, len(runs)) for group in (solution.costates, solution.replays)):
+        raise ValueError("costates or replays, which are not one per scenario")
+    for name, limits in solution.bounds.items():
+        if limits.shape != (2, nodes) or name.removeprefix(RATE) not in runs[0]:
+            raise ValueError(f"bounds of {name}")
+    arrays = (edges, solution.solver_state, *solution.multipliers.values())
+    if any(a.dtype != np.float64 for a in (*arrays, *solution.bounds.values())):
+        raise ValueError("an array, expected 64-bit numbers")
 
 
 def _apart(
@@ -157,7 +241,12 @@ def _optimality(manifest: Mapping[str, Any]) -> Optimality | None:
     measured = manifest.get("optimality")
     if measured is None:
         return None
-    return Optimality(**{k: np.nan if v is None else float(v) for k, v in measured.items()})
+    return Optimality(**_numbers(measured))
+
+
+def _numbers(values: Mapping[str, float | None]) -> dict[str, float]:
+    """What JSON holds for numbers that may be NaN."""
+    return {k: np.nan if v is None else float(v) for k, v in values.items()}
 
 
 def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
@@ -165,4 +254,4 @@ def _group(prefix: str, tensors: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _is_solution(path: Path) -> bool:
-    return {p.name for p in path.iterdir()} - {PAGE} == {MANIFEST, TENSORS}
+    return visible(path) - {PAGE} == {MANIFEST, TENSORS}

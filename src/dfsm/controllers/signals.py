@@ -5,24 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from dfsm.core.units import ANGLES, POWERS, SPEEDS, TORQUES, plain
+from dfsm.core.units import factor
 from dfsm.errors import DfsmError, near_matches
 
-_TURNS = {"rad/s^2": 1.0, "deg/s^2": np.pi / 180}
-_WATTS = {unit: 1e3 * factor for unit, factor in POWERS.items()}
-
-# Role: channel as OpenFAST calls it, its unit, and what its units are in SI.
-_ROLES: dict[str, tuple[str, str, dict[str, float]]] = {
-    "generator_speed": ("GenSpeed", "rpm", SPEEDS),
-    "rotor_speed": ("RotSpeed", "rpm", SPEEDS),
-    "wind": ("RotWind", "m/s", {"m/s": 1.0}),
-    "nacelle_pitch_acceleration": ("NcIMURAys", "deg/s^2", _TURNS),
-    "nacelle_acceleration": ("YawBrTAxp", "m/s^2", {"m/s^2": 1.0}),
-    "power": ("GenPwr", "kW", _WATTS),
-    "torque": ("GenTq", "kN-m", TORQUES),
-    "pitch": ("BldPitch1", "deg", ANGLES),
+# Role: channel as OpenFAST calls it, its unit, and the unit in SI.
+_ROLES: dict[str, tuple[str, str, str]] = {
+    "generator_speed": ("GenSpeed", "rpm", "rad/s"),
+    "rotor_speed": ("RotSpeed", "rpm", "rad/s"),
+    "wind": ("RotWind", "m/s", "m/s"),
+    "nacelle_pitch_acceleration": ("NcIMURAys", "deg/s^2", "rad/s^2"),
+    "nacelle_acceleration": ("YawBrTAxp", "m/s^2", "m/s^2"),
+    "power": ("GenPwr", "kW", "W"),
+    "torque": ("GenTq", "kN-m", "N-m"),
+    "pitch": ("BldPitch1", "deg", "rad"),
 }
 
 
@@ -66,14 +61,16 @@ def signals(roles: Sequence[str], channels: Mapping[str, str | tuple[str, str]])
             raise DfsmError(f"channels: there is no role '{role}'; {near_matches(role, _ROLES)}")
     names, units, factors = [], [], []
     for role in roles:
-        name, unit, known = _ROLES[role]
+        name, unit, si = _ROLES[role]
         told = channels.get(role, name)
         name, unit = (told, unit) if isinstance(told, str) else told
-        if plain(unit) not in known:
+        size = factor(unit, si)
+        if size is None:
             raise DfsmError(
-                f"channels: {role} '{name}' is in '{unit}', expected one of {', '.join(known)}"
+                f"channels: {role} '{name}' is in '{unit}', which is no unit like "
+                f"{_ROLES[role][1]} or {si}: name another channel, or its right unit"
             )
         names.append(name)
         units.append(unit)
-        factors.append(known[plain(unit)])
+        factors.append(size)
     return Signals(tuple(roles), tuple(names), tuple(units), tuple(factors))

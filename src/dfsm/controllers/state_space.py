@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, expm, solve_discrete_are
 
-from dfsm.controllers.rosco_blocks import within
+from dfsm.controllers.rosco_blocks import unwound, within
 from dfsm.core.settings import require
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
@@ -146,10 +146,7 @@ class StateFeedback(eqx.Module):
         if self.integral_gain is None:
             return state, within(wanted, *self.limits)
         by = -self.interval * self.integral_gain @ error
-        low, high = self.limits
-        unlimited = wanted + state + by
-        waits = ((unlimited > high) & (by > 0)) | ((unlimited < low) & (by < 0))
-        state = jnp.where(waits, state, state + by)
+        state = unwound(state, state + by, wanted, self.limits)
         return state, within(wanted + state, *self.limits)
 
 

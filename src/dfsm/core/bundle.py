@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load, save
 
 from dfsm.core.files import check_format, json_bytes, json_value, write_folder
 from dfsm.core.types import Array
@@ -48,19 +48,34 @@ class Bundle:
         tensors: Mapping[str, Array],
         content: Mapping[str, Any],
         is_ours: Callable[[Path], bool],
+        pages: Mapping[str, Callable[[Path], object]] | None = None,
     ) -> None:
-        """Write a folder in one step, in the place of one that `is_ours`."""
-        arrays = {name: np.ascontiguousarray(a) for name, a in tensors.items()}
+        """Write a folder in one step, in the place of one that `is_ours`.
+
+        Parameters
+        ----------
+        path
+            Folder to make.
+        tensors, content
+            Arrays by name, and what else the manifest says.
+        is_ours
+            See `write_folder`.
+        pages
+            By file name what writes a page about them, into the same folder in the same step.
+        """
+        # Made in memory: the library that writes them does not tell a full disk from a bug.
+        arrays = save({name: np.ascontiguousarray(a) for name, a in tensors.items()})
         with write_folder(path, is_ours=is_ours) as folder:
-            save_file(arrays, folder / self.tensors)
-            manifest: dict[str, Any] = {
+            (folder / self.tensors).write_bytes(arrays)
+            manifest = {
                 "format": self.format,
                 "dfsm": __version__,
-                "sha256": hashlib.sha256((folder / self.tensors).read_bytes()).hexdigest(),
+                "sha256": hashlib.sha256(arrays).hexdigest(),
                 **content,
             }
-            manifest["checksum"] = _checksum(manifest)
-            (folder / MANIFEST).write_bytes(json_bytes(manifest))
+            (folder / MANIFEST).write_bytes(json_bytes(signed(manifest)))
+            for name, write in (pages or {}).items():
+                write(folder / name)
 
     def read_manifest(self, path: Path) -> dict[str, Any]:
         """Read and check the manifest of a folder that holds one."""
@@ -72,7 +87,7 @@ class Bundle:
         if not isinstance(version, int):
             raise self.damaged(path, f"{MANIFEST} states no format number")
         check_format(path, version, self.format)
-        if manifest.get("checksum") != _checksum(manifest):
+        if manifest.get("checksum") != checksum(manifest):
             raise self.damaged(path, f"{MANIFEST} is not as it was written")
         return manifest
 
@@ -80,14 +95,14 @@ class Bundle:
         """Read the arrays that the manifest was written for."""
         file = path / self.tensors
         try:
-            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+            content = file.read_bytes()
         except OSError as error:
             raise self.damaged(path, f"{file.name} cannot be read ({error.strerror})") from None
-        if digest != manifest.get("sha256"):
+        if hashlib.sha256(content).hexdigest() != manifest.get("sha256"):
             raise self.damaged(path, f"{file.name} is not the file that {MANIFEST} was written for")
         try:
-            return load_file(file)
-        except SafetensorError as error:
+            return load(content)
+        except (SafetensorError, ValueError, TypeError, KeyError) as error:
             raise self.damaged(path, f"{file.name} cannot be read ({error})") from None
 
     def damaged(self, path: Path, what: str) -> DfsmError:
@@ -95,7 +110,27 @@ class Bundle:
         return DfsmError(f"{path} is damaged: {what}; {self.cure} or restore the folder")
 
 
-def _checksum(manifest: Mapping[str, Any]) -> str:
-    """Digest of all that a manifest says, however its JSON is laid out."""
-    said = {k: v for k, v in manifest.items() if k != "checksum"}
+def checksum(content: Mapping[str, Any]) -> str:
+    """Digest of all that a mapping of JSON values says, however its JSON is laid out."""
+    said = {k: v for k, v in content.items() if k != "checksum"}
     return hashlib.sha256(json.dumps(json_value(said), sort_keys=True).encode()).hexdigest()
+
+
+def signed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with its digest, for a file of JSON that is more than figures to look at."""
+    return {**content, "checksum": checksum(content)}
+
+
+def is_as_written(content: Mapping[str, Any], known: Collection[str]) -> bool:
+    """Whether what `signed` made is unchanged.
+
+    Parameters
+    ----------
+    content
+        What the file holds.
+    known
+        The keys of such files in version 0.1, which had no digest; no other file may lack it.
+    """
+    if "checksum" not in content:
+        return set(content) <= set(known)
+    return content["checksum"] == checksum(content)

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dfsm.core.exchange import beginning, exchange, recover, settle, settle_names
+from dfsm.core.lock import locked
 from dfsm.core.version import __version__
 from dfsm.errors import DfsmError, near_matches
 
@@ -21,25 +23,29 @@ def write_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it takes the place of `path`.
 
     On any failure, Ctrl-C included, the temporary file is removed and what stood at `path`
-    before is untouched.
+    before is untouched. The new file is on the disk before it has the name.
 
     Raises
     ------
     DfsmError
-        The folder does not exist, cannot be written, or the disk is full.
+        The folder does not exist, cannot be written, the disk is full, or another process is
+        writing the file.
     """
     path = Path(path)
     _check_ordinary(path)
     # The file that a link points to is replaced, not the link.
     path = path.resolve() if path.is_symlink() else path
-    with _sentences(path):
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    with _sentences(path), locked(path):
+        recover(path)
+        handle, name = tempfile.mkstemp(prefix=beginning(path), dir=path.parent)
         os.close(handle)
         temporary = Path(name)
         try:
             yield temporary
             temporary.chmod(0o666 & ~_umask())
+            settle(temporary)
             temporary.replace(path)
+            settle_names(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -49,25 +55,46 @@ def write_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> Iterat
     """Yield a temporary folder beside `path`; on success it takes the place of `path`.
 
     An existing folder is replaced only where `is_ours` says that it holds nothing but what
-    this package wrote, so that a mistyped `-o` never costs a user their results.
+    this package wrote, so that a mistyped `-o` never costs a user their results. Whenever the
+    process is killed, `path` is whole: the old folder or the new one. What the system or a file
+    manager keeps in it, in names that begin with a dot, is copied into the new one.
 
     Raises
     ------
     DfsmError
-        `path` exists and is not ours, or cannot be written.
+        `path` exists and is not ours, is being written by another process, or cannot be written.
     """
     path = Path(path)
     check_folder(path, is_ours=is_ours)
-    with _sentences(path):
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    # The folder that a link points to is replaced, not the link.
+    path = path.resolve() if path.is_symlink() else path
+    with _sentences(path), locked(path):
+        recover(path)
+        temporary = Path(tempfile.mkdtemp(prefix=beginning(path), dir=path.parent))
         try:
             yield temporary
             temporary.chmod(0o777 & ~_umask())
             for file in temporary.iterdir():
                 file.chmod(0o666 & ~_umask())
-            _exchange(temporary, path)
+            _copy_hidden(path, temporary)
+            exchange(temporary, path)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def visible(folder: Path) -> set[str]:
+    """Names in a folder but for those that begin with a dot, which systems put there."""
+    return {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+
+
+def _copy_hidden(old: Path, new: Path) -> None:
+    for entry in old.iterdir() if old.is_dir() else ():
+        if not entry.name.startswith("."):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.copytree(entry, new / entry.name, symlinks=True)
+        elif entry.is_file() or entry.is_symlink():
+            shutil.copy2(entry, new / entry.name, follow_symlinks=False)
 
 
 def check_file(path: str | Path, sources: Iterable[str | Path | None] = ()) -> None:
@@ -116,7 +143,8 @@ def check_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> None:
         `path` exists and is not ours, or its parent is no folder.
     """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and (not any(path.iterdir()) or is_ours(path))):
+    recover(path)
+    if path.exists() and not (path.is_dir() and (_is_empty(path) or is_ours(path))):
         raise DfsmError(
             f"{path} exists and is not a folder that dfsm wrote: choose another name or remove it"
         )
@@ -126,6 +154,11 @@ def check_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> None:
             "give the name of a folder in it"
         )
     _check_parent(path)
+
+
+def _is_empty(folder: Path) -> bool:
+    # A folder in it may be somebody's, whatever its name.
+    return not any(p.is_dir() or not p.name.startswith(".") for p in folder.iterdir())
 
 
 def _check_ordinary(path: Path) -> None:
@@ -146,33 +179,19 @@ def _check_parent(path: Path) -> None:
         )
 
 
-def _exchange(new: Path, path: Path) -> None:
-    """Put `new` in the place of `path`; what stood there comes back if that fails."""
-    if not path.exists():
-        new.rename(path)
-        return
-    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-    old = aside / "replaced"
-    try:
-        path.rename(old)
-        new.rename(path)
-    except BaseException:
-        if old.exists() and not path.exists():
-            old.rename(path)
-        raise
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
-
-
 @contextmanager
 def _sentences(path: Path) -> Iterator[None]:
     try:
         yield
-    except OSError as error:
+    except (OSError, DfsmError) as error:
+        # What was to be a part of a folder is told of by the folder's name.
+        cause = error.__cause__ if isinstance(error, DfsmError) else error
+        if not isinstance(cause, OSError):
+            raise
         raise DfsmError(
-            f"{path} could not be written ({error.strerror or error}); nothing was left behind: "
+            f"{path} could not be written ({cause.strerror or cause}); nothing was left behind: "
             "make room or choose another place"
-        ) from error
+        ) from cause
 
 
 def _umask() -> int:

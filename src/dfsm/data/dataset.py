@@ -9,6 +9,7 @@ from typing import overload
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.core.units import agree, known
 from dfsm.data.trajectory import Channel, Trajectory, labels
 from dfsm.errors import DfsmError
 
@@ -74,23 +75,24 @@ class Dataset(Sequence[Trajectory]):
     def channel(self, name: str) -> Channel:
         """Describe a channel over all runs: its unit, and the coarsest quantisation step.
 
+        The unit is as the first run that states one spells it.
+
         Raises
         ------
         DfsmError
             A run lacks the channel, or two runs give it different units.
         """
-        first = self.runs[0].channel(name)
-        steps = []
-        for run in self.runs:
-            channel = run.channel(name)
-            steps.append(channel.step)
-            if channel.unit != first.unit:
+        channels = [run.channel(name) for run in self.runs]
+        stated = next((k for k, c in enumerate(channels) if known(c.unit)), 0)
+        first = channels[stated]
+        for run, channel in zip(self.runs, channels, strict=True):
+            if not agree(channel.unit, first.unit):
                 raise DfsmError(
-                    f"channel '{name}' is in '{first.unit}' in {self.runs[0].where} but in "
+                    f"channel '{name}' is in '{first.unit}' in {self.runs[stated].where} but in "
                     f"'{channel.unit}' in {run.where}: convert one of them"
                 )
-        known = [s for s in steps if s is not None]
-        return replace(first, step=max(known) if known else None)
+        steps = [c.step for c in channels if c.step is not None]
+        return replace(channels[0], unit=first.unit, step=max(steps) if steps else None)
 
     def select(self, names: Iterable[str]) -> Dataset:
         """Keep the named channels of every run; units must agree between runs."""

@@ -14,13 +14,18 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.settings import settings_class
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
+from dfsm.core.units import agree
+from dfsm.data.signs import wrapping
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.filters import Filter, filtered
+from dfsm.numerics.pieces import Estimate, piecewise
 from dfsm.numerics.smoothing import SmoothResult, cubic_spline, interpolate, smoothing_spline
+from dfsm.numerics.time_mesh import same_instant
 
 __all__ = [
     "DerivativeSettings",
@@ -31,10 +36,19 @@ __all__ = [
     "cubic_spline",
     "differentiate",
     "kinematic_rows",
+    "lead_in",
     "smoothing_spline",
     "state_names",
     "state_units",
 ]
+
+# Share of its range by which a state may differ in two samples at one instant.
+_ONE_VALUE = 1e-3
+
+
+# Samples before the first that is used, which smoothing may need; filter windows, and periods of a
+# cutoff, after which filters have forgotten.
+_MARGIN_SAMPLES, _WINDOWS, _PERIODS = 200, 2.0, 5.0
 
 
 @settings_class
@@ -128,6 +142,7 @@ class Differentiated:
     derivative_names: tuple[str, ...]
     derivative_units: tuple[str, ...]
     noise_std: tuple[float | None, ...]
+    direct: NDArray[np.bool_]
 
 
 def state_names(states: Sequence[StateSpec]) -> tuple[str, ...]:
@@ -166,18 +181,44 @@ def kinematic_rows(states: Sequence[StateSpec]) -> dict[int, int]:
     return {i: len(states) + j for j, i in enumerate(second)}
 
 
+def lead_in(run: Trajectory, start: float | None, settings: DerivativeSettings) -> Trajectory:
+    """A run from `start` less what derivatives need before it: what lies earlier has no say.
+
+    A bad sample at the beginning, and a transient that is left out, would otherwise decide with the
+    rest how much is smoothed.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    start
+        First time in s at which derivatives are wanted; None for all.
+    settings
+        Filters remember for longer than splines.
+    """
+    if start is None or start <= run.time[0]:
+        return run
+    memory = [
+        _WINDOWS * f.window if f.window is not None else _PERIODS / (f.cutoff or np.inf)
+        for f in settings.filters.values()
+    ]
+    usual = run.duration / (len(run) - 1)
+    return run.window(start - max([_MARGIN_SAMPLES * usual, *memory]), None)
+
+
 def differentiate(
     trajectory: Trajectory,
     states: Sequence[StateSpec],
     settings: DerivativeSettings | None = None,
+    breaks: IntArray | None = None,
 ) -> Differentiated:
     """Find the states and their derivatives of one run.
 
     A recorded rate or acceleration is used as it stands (filtered where the state is), except
     that a recorded rate which must itself be differentiated is smoothed like a state.
     With a filter the state is first freed of noise, then filtered, then differentiated, so that
-    q̇ stays the derivative of q. Smooth the whole run and cut the time window afterwards: the
-    second derivative is least certain in the last few samples.
+    q̇ stays the derivative of q. Smooth more than is used and cut the time window afterwards (see
+    `lead_in`): the second derivative is least certain in the first and last few samples.
 
     Parameters
     ----------
@@ -187,6 +228,9 @@ def differentiate(
         See `StateSpec`.
     settings
         See `DerivativeSettings`; None takes the defaults.
+    breaks
+        First sample after each jump of an input, see `jumps`: derivatives are taken between them,
+        but for states with a filter, which leaves no kink. Samples at one instant are one.
 
     Returns
     -------
@@ -196,13 +240,13 @@ def differentiate(
     Raises
     ------
     DfsmError
-        An unknown channel or filter, a channel with NaN, a constant state, units that disagree,
-        a name that is taken, or too few samples.
+        An unknown channel or filter, a channel with NaN, units that disagree, a name that is taken,
+        too few samples, or a state that differs in two samples at one instant.
     """
     settings = settings or DerivativeSettings()
     names = state_names(states)
     _check_names(trajectory, states, settings)
-    extracted = [_differentiate_state(trajectory, s, settings) for s in states]
+    extracted = [_differentiate_state(trajectory, s, settings, breaks) for s in states]
     second = [i for i, s in enumerate(states) if s.order == 2]
 
     values = trajectory.values.copy()
@@ -233,6 +277,7 @@ def differentiate(
         ),
         derivative_units=tuple(per_second(u) for u in state_units(states, trajectory)),
         noise_std=(*(f.noise_std for f in extracted), *(None for _ in second)),
+        direct=np.logical_and.reduce([f.direct for f in extracted]),
     )
 
 
@@ -245,48 +290,110 @@ class _State:
     rate: Array
     acceleration: Array
     noise_std: float | None
+    direct: NDArray[np.bool_]
 
 
-def _differentiate_state(run: Trajectory, spec: StateSpec, settings: DerivativeSettings) -> _State:
+def _differentiate_state(
+    run: Trajectory, spec: StateSpec, settings: DerivativeSettings, breaks: IntArray | None
+) -> _State:
     run.select(spec.channels).require_finite()
+    _refuse_wrap(run, spec.name)
     chosen = settings.filters.get(spec.name)
-    state = _estimate(run, spec.name, chosen, settings)
+    state = _estimate(run, spec.name, chosen, settings, breaks)
+    everywhere = np.ones(len(run), bool)
     if spec.rate is not None:
         _check_unit(run, spec, spec.rate, 1)
         if spec.order == 2 and spec.acceleration is None:
-            rate = _estimate(run, spec.rate, chosen, settings)
-            state = replace(state, rate=rate.q, acceleration=rate.rate)
+            rate = _estimate(run, spec.rate, chosen, settings, breaks)
+            state = replace(state, rate=rate.q, acceleration=rate.rate, direct=rate.direct)
         else:
-            state = replace(state, rate=filtered(run.time, run[spec.rate], chosen))
+            recorded = filtered(run.time, run[spec.rate], chosen)
+            told = everywhere if spec.order == 1 else state.direct
+            state = replace(state, rate=recorded, direct=told)
     if spec.acceleration is not None:
         _check_unit(run, spec, spec.acceleration, 2)
         recorded = filtered(run.time, run[spec.acceleration], chosen)
-        state = replace(state, acceleration=recorded)
-    # The rate of a state of order 1 is only a derivative, and that may be constant.
-    checks = [(state.q, "state"), (state.rate, "rate of state")][: spec.order]
-    for values, what in checks:
-        if np.ptp(values) <= 1e-12 * np.abs(values).max():
-            raise DfsmError(
-                f"{run.where}: {what} '{spec.name}' is constant, so nothing can be learnt about "
-                "its derivative: choose another state, another filter or leave the run out"
-            )
+        state = replace(state, acceleration=recorded, direct=everywhere)
     return state
 
 
+def _refuse_wrap(run: Trajectory, name: str) -> None:
+    unit = run.channel(name).unit
+    if wrap := wrapping(run.time, run[name], unit):
+        raise DfsmError(
+            f"{run.where}: state '{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''} "
+            f"({wrap.times} times, first at {wrap.first:g} s), so that its derivative jumps there: "
+            "unwrap it (numpy.unwrap), or take its speed as the state"
+        )
+
+
+def require_moving(states: Sequence[StateSpec], values: Array) -> None:
+    """Refuse states that are the same in all training samples.
+
+    Parameters
+    ----------
+    states
+        See `StateSpec`.
+    values
+        Samples of ξ over all runs, shape ``(sample, state)``, in the order of `state_names`.
+
+    Raises
+    ------
+    DfsmError
+        Names the first such state, or the state whose rate it is.
+    """
+    second = [s.name for s in states if s.order == 2]
+    names = [*(f"state '{s.name}'" for s in states), *(f"rate of state '{n}'" for n in second)]
+    for what, column in zip(names, values.T, strict=True):
+        if np.ptp(column) <= 1e-12 * np.abs(column).max():
+            raise DfsmError(
+                f"{what} is constant in all training samples, so nothing can be learnt about its "
+                "derivative: choose another state, another filter or add runs in which it moves"
+            )
+
+
 def _estimate(
-    run: Trajectory, name: str, chosen: Filter | None, settings: DerivativeSettings
+    run: Trajectory,
+    name: str,
+    chosen: Filter | None,
+    settings: DerivativeSettings,
+    breaks: IntArray | None,
 ) -> _State:
-    time, values = run.time, run[name]
-    try:
+    step = run.channel(name).step
+
+    def estimate(time: Array, values: Array) -> Estimate:
         if settings.method == "cubic_spline":
-            return _State(*cubic_spline(time, filtered(time, values, chosen)), None)
-        smooth = smoothing_spline(time, values, run.channel(name).step)
+            return *cubic_spline(time, filtered(time, values, chosen)), None
+        smooth = smoothing_spline(time, values, step)
         if chosen is None:
-            return _State(smooth.values, smooth.first, smooth.second, smooth.noise_std)
+            return smooth.values, smooth.first, smooth.second, smooth.noise_std
         filtered_values = filtered(time, smooth.values, chosen)
-        return _State(*interpolate(time, filtered_values), smooth.noise_std)
+        return *interpolate(time, filtered_values), smooth.noise_std
+
+    breaks = np.empty(0, dtype=int) if breaks is None or chosen is not None else breaks
+    twice = same_instant(run.time)
+    _require_one_value(run, name, twice)
+    try:
+        if len(breaks) or twice.any():
+            return _State(*piecewise(run.time, run[name], breaks, estimate))
+        return _State(*estimate(run.time, run[name]), np.ones(len(run), bool))
     except DfsmError as error:
         raise DfsmError(f"{run.where}: channel '{name}': {error}") from None
+
+
+def _require_one_value(run: Trajectory, name: str, twice: NDArray[np.bool_]) -> None:
+    """Two samples at one instant are before and after a jump of inputs, at which no state jumps."""
+    if not twice.any():
+        return
+    values = run[name]
+    apart = np.abs(np.diff(values)) * twice
+    if apart.max() > _ONE_VALUE * np.ptp(values) + (run.channel(name).step or 0.0):
+        row = int(np.argmax(apart))
+        raise DfsmError(
+            f"{run.where}: '{name}' goes from {values[row]:g} to {values[row + 1]:g} in no time, "
+            f"at {run.time[row]:g} s, but a derivative leads to no jump of a state: cut the run "
+            "there, or drop the repeated sample"
+        )
 
 
 # -- names and units ----------------------------------------------------------------------------
@@ -317,7 +424,7 @@ def _check_unit(run: Trajectory, spec: StateSpec, name: str, times: int) -> None
     wanted = unit
     for _ in range(times):
         wanted = per_second(wanted)
-    if unit and its and _time_power(its) != _time_power(wanted):
+    if not agree(its, wanted):
         raise DfsmError(
             f"{run.where}: channel '{name}' in '{its}' is not the "
             f"{('first', 'second')[times - 1]} derivative of '{spec.name}' in '{unit}': a channel "

@@ -1,4 +1,4 @@
-"""Inputs computed from disturbances: a rate, a copy that lags behind, or a difference.
+"""Inputs computed from disturbances: a rate, a copy that lags or is late, or a difference.
 
 A force often follows from the history of a disturbance: wave forces from the elevation and its
 rate, the induced wind from the wind of the last seconds. Declared features are computed from a
@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
-from dfsm.core.units import plain
+from dfsm.core.units import agree
 from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -24,7 +24,7 @@ from dfsm.numerics.smoothing import smoothing_spline
 
 @settings_class
 class Feature:
-    """A disturbance made of others.
+    """A disturbance made of others, or a control that acts late.
 
     Attributes
     ----------
@@ -35,30 +35,31 @@ class Feature:
         named ``<source>_dot``. ``"lag"``: a first-order lag, ``τ dz/dt = source - z``, at rest when
         the record starts; named ``<source>_lag<τ>``. ``"difference"``: source less another
         disturbance in the same unit, e.g. the wind over a ring of the rotor less that over the
-        disk; named ``<source>-<less>``.
+        disk; named ``<source>-<less>``. ``"delay"``: the source so many seconds ago, as it was at
+        first where the record does not go back so far; named ``<source>_delay<seconds>``. Only for
+        a delay the source may be a control; a model with one cannot be optimized.
     time_constant
         τ of a lag in s.
+    seconds
+        How late a delay is.
     less
         What a difference takes off.
     """
 
     source: str
-    kind: Literal["rate", "lag", "difference"] = "rate"
+    kind: Literal["rate", "lag", "difference", "delay"] = "rate"
     time_constant: float | None = None
     less: str | None = None
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
-        if self.kind == "lag":
-            seconds = self.time_constant
-            positive = seconds is not None and bool(np.isfinite(seconds)) and seconds > 0
-            require(positive, "features.time_constant", seconds, "a positive number of seconds")
-        else:
-            require(
-                self.time_constant is None,
-                "features.time_constant",
-                self.time_constant,
-                f"none for a {self.kind}",
-            )
+        for key, kind in (("time_constant", "lag"), ("seconds", "delay")):
+            value: float | None = getattr(self, key)
+            if self.kind == kind:
+                positive = value is not None and bool(np.isfinite(value)) and value > 0
+                require(positive, f"features.{key}", value, "a positive number of seconds")
+            else:
+                require(value is None, f"features.{key}", value, f"none for a {self.kind}")
         right = (self.less is not None) == (self.kind == "difference")
         expected = "a disturbance" if self.kind == "difference" else f"none for a {self.kind}"
         require(right, "features.less", self.less, expected)
@@ -75,6 +76,8 @@ class Feature:
             return f"{self.source}_dot"
         if self.kind == "difference":
             return f"{self.source}-{self.less}"
+        if self.kind == "delay":
+            return f"{self.source}_delay{self.seconds:g}"
         return f"{self.source}_lag{self.time_constant:g}"
 
 
@@ -106,6 +109,9 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
             values, unit = _rate(run, feature), per_second(source.unit)
         elif feature.kind == "lag":
             values, unit = _lagged(run, feature), source.unit
+        elif feature.seconds is not None:
+            values = np.interp(run.time - feature.seconds, run.time, run[source.name])
+            unit = source.unit
         else:
             _require_one_unit(run, source, others[0])
             values, unit = run[source.name] - run[others[0].name], source.unit
@@ -115,8 +121,27 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
     return run
 
 
+def acting_late(features: Iterable[Feature], controls: Iterable[str]) -> dict[str, str]:
+    """Features that hold what a control did before, each with that control.
+
+    Parameters
+    ----------
+    features
+        In the order in which they are computed.
+    controls
+        What an optimizer chooses.
+    """
+    origin = {name: name for name in controls}
+    late: dict[str, str] = {}
+    for feature in features:
+        for source in feature.sources:
+            if source in origin:
+                late[feature.name] = origin[feature.name] = origin[source]
+    return late
+
+
 def _require_one_unit(run: Trajectory, source: Channel, other: Channel) -> None:
-    if plain(source.unit) != plain(other.unit):
+    if not agree(source.unit, other.unit):
         raise DfsmError(
             f"{run.where}: a feature takes '{other.name}' ({other.unit}) off '{source.name}' "
             f"({source.unit}): name two channels in one unit"

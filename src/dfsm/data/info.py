@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrapping
+from dfsm.data.slower import slower_warning
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind import wind_warning
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
+
+# What differs from run to run in sentences that say the same: lists of channels, and numbers.
+_CHANNELS = re.compile(r"\bin '[^']*'(?:, '[^']*')*(?: and \d+ more channels)?")
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -22,7 +32,8 @@ class ChannelInfo:
     name, unit
         As in the file.
     min, max, mean, std
-        Over the finite samples; NaN where there is none. `std` divides by the sample count.
+        Over the finite samples; NaN where there is none. `mean` and `std` are those over time,
+        whatever the mesh; on an equidistant one `std` divides by the sample count.
     step
         Quantisation step, None where the file states none.
     """
@@ -107,15 +118,19 @@ def describe(trajectory: Trajectory) -> RunInfo:
         max_interval=float(steps.max()),
         wall_time=trajectory.wall_time,
         channels=tuple(
-            _channel_info(c, v)
+            _channel_info(c, v, trajectory.time)
             for c, v in zip(trajectory.channels, trajectory.values.T, strict=True)
         ),
         warnings=tuple(_warnings(trajectory)),
     )
 
 
-def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
-    good = values[np.isfinite(values)]
+def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
+    if len(values) > _BLOCK and weights_over_time([time]) is None:
+        return _long_channel_info(channel, values, time)
+    finite = np.isfinite(values)
+    good, time = values[finite], time[finite]
+    weights = weights_over_time([time]) if len(time) > 1 else None
     if not len(good):
         nan = math.nan
         return ChannelInfo(channel.name, channel.unit, nan, nan, nan, nan, channel.step)
@@ -124,10 +139,40 @@ def _channel_info(channel: Channel, values: Array) -> ChannelInfo:
         channel.unit,
         float(good.min()),
         float(good.max()),
-        float(good.mean()),
-        float(good.std()),
+        float(mean_over(good, weights)),
+        float(std_over(good, weights)),
         channel.step,
     )
+
+
+# Samples of a channel that are looked at together: a long run is not copied for its statistics.
+_BLOCK = 1_000_000
+
+
+def _long_channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
+    """The same part by part; mean and standard deviation differ in their last digits."""
+    low, high, total, count = math.inf, -math.inf, 0.0, 0
+    for good in _finite_parts(values):
+        low, high = min(low, float(good.min())), max(high, float(good.max()))
+        total, count = total + float(good.sum()), count + len(good)
+    if not count:
+        return _channel_info(channel, values[:1], time[:1])
+    mean = total / count
+    squares = sum(float(np.sum((good - mean) ** 2)) for good in _finite_parts(values))
+    std = math.sqrt(squares / count)
+    return ChannelInfo(channel.name, channel.unit, low, high, mean, std, channel.step)
+
+
+def _parts(values: Array) -> Iterator[Array]:
+    for first in range(0, len(values), _BLOCK):
+        yield np.ascontiguousarray(values[first : first + _BLOCK])
+
+
+def _finite_parts(values: Array) -> Iterator[Array]:
+    for part in _parts(values):
+        good = part[np.isfinite(part)]
+        if len(good):
+            yield good
 
 
 # Steps this many times the usual one are a hole in the record, not an adaptive mesh.
@@ -149,7 +194,13 @@ def gap_warning(trajectory: Trajectory) -> str | None:
     """
     steps = np.diff(trajectory.time)
     gap = int(np.argmax(steps))
-    if steps[gap] <= _GAP * np.median(steps):
+    others = np.sort(np.delete(steps, gap))
+    if not len(others):
+        return None
+    # The usual step is that of half the time, not of half the samples: an adaptive solver may put
+    # most of these where it starts.
+    usual = others[np.searchsorted(np.cumsum(others), others.sum() / 2)]
+    if steps[gap] <= _GAP * usual:
         return None
     return (
         f"there is a gap of {steps[gap]:g} s after {trajectory.time[gap]:g} s, which a fit bridges "
@@ -161,10 +212,13 @@ def _warnings(trajectory: Trajectory) -> list[str]:
     sentences = []
     if gap := gap_warning(trajectory):
         sentences.append(gap)
+    sentences += _starts(trajectory)
     seen: dict[bytes, str] = {}
     for name, values in zip(trajectory.names, trajectory.values.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
+        if slower := slower_warning(trajectory, name):
+            sentences.append(slower)
+        elif len(bad):
             sentences.append(
                 f"'{name}' has {len(bad)} NaN or infinite samples, the first at "
                 f"{trajectory.time[bad[0]]:g} s"
@@ -173,12 +227,131 @@ def _warnings(trajectory: Trajectory) -> list[str]:
             # Two constants often agree by chance: that they are constant says enough.
             sentences.append(f"'{name}' is constant ({values[0]:g})")
             continue
-        data = values.tobytes()
+        h = hashlib.sha256()
+        for part in _parts(values):
+            h.update(part.data)
+        data = h.digest()
         if data in seen:
             sentences.append(f"'{name}' holds the same data as '{seen[data]}'")
         else:
             seen[data] = name
+            sentences += _looks(trajectory, name)
     return [*sentences, *trajectory.notes]
+
+
+def _looks(run: Trajectory, name: str) -> list[str]:
+    """What a channel is, from its name and its samples."""
+    sentences, unit = [], run.channel(name).unit
+    if wrap := wrapping(run.time, run[name], unit):
+        sentences.append(
+            f"'{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''}, {wrap.times} times, "
+            f"first at {wrap.first:g} s: as a state it must go on (numpy.unwrap)"
+        )
+    if interval := held_interval(run.time, run[name]):
+        sentences.append(
+            f"'{name}' changes every {interval:g} s only and stays as it was in between: a slower "
+            "record, or a held command"
+        )
+    if text := wind_warning(name):
+        sentences.append(text)
+    return sentences
+
+
+def _starts(run: Trajectory) -> list[str]:
+    """What is wrong with the beginning of a run."""
+    sentences = []
+    jumping = [n for n in run.names if jumps_at_first(run[n])]
+    if jumping:
+        sentences.append(
+            f"the first sample has nothing to do with the next in {_some(jumping)}: leave it out "
+            "with data.start"
+        )
+    ends = {n: t for n in run.names if (t := transient_end(run.time, run[n])) is not None}
+    if ends:
+        sentences.append(
+            f"a transient, until {max(ends.values()):.4g} s in {_some(list(ends))}, is far from "
+            "all that follows: start behind it with data.start, unless it is what matters"
+        )
+    return sentences
+
+
+def _some(names: Sequence[str], most: int = 4) -> str:
+    """The first names, and how many there are beside them."""
+    shown = ", ".join(f"'{n}'" for n in names[:most])
+    return shown + (f" and {len(names) - most} more channels" if len(names) > most else "")
+
+
+def counted(told: Iterable[tuple[str, Iterable[str]]]) -> list[str]:
+    """Sentences about several runs, each once: where first, and how often.
+
+    Parameters
+    ----------
+    told
+        Run and its sentences. Those that differ in numbers or lists of channels count as one.
+
+    Returns
+    -------
+    list[str]
+        ``"a.outb: 'x' is constant (7) (and 3 more runs)"``, in the order of their first occurrence.
+    """
+    found: dict[str, tuple[str, set[str]]] = {}
+    for where, sentences in told:
+        for sentence in sentences:
+            parts = _CHANNELS.sub("in them", sentence).split("'")
+            parts[::2] = [_NUMBER.sub("#", part) for part in parts[::2]]
+            _, runs = found.setdefault("'".join(parts), (f"{where}: {sentence}", set()))
+            runs.add(where)
+    return [
+        first + (f" (and {len(runs) - 1} more run{'s' * (len(runs) > 2)})" if len(runs) > 1 else "")
+        for first, runs in found.values()
+    ]
+
+
+@dataclass(frozen=True)
+class MergedChannel:
+    """One channel over several runs.
+
+    Attributes
+    ----------
+    name, units
+        As in the files; several units where runs do not agree.
+    min, max
+        Over the finite samples of all runs, in the channel's unit; NaN where there is none.
+    runs
+        How many runs have it.
+    steps
+        Smallest and largest quantisation step; None where no run states one.
+    """
+
+    name: str
+    units: tuple[str, ...]
+    min: float
+    max: float
+    runs: int
+    steps: tuple[float, float] | None
+
+
+def merged(runs: Sequence[RunInfo]) -> list[MergedChannel]:
+    """Describe every channel over all runs, in the order of their first occurrence."""
+    channels: dict[str, list[ChannelInfo]] = {}
+    for run in runs:
+        for channel in run.channels:
+            channels.setdefault(channel.name, []).append(channel)
+    result = []
+    for name, parts in channels.items():
+        steps = [c.step for c in parts if c.step is not None]
+        known = [c for c in parts if not math.isnan(c.min)]
+        result.append(
+            MergedChannel(
+                name,
+                tuple(dict.fromkeys(c.unit for c in parts)),
+                min((c.min for c in known), default=math.nan),
+                max((c.max for c in known), default=math.nan),
+                len(parts),
+                (min(steps), max(steps)) if steps else None,
+            )
+        )
+    return result
 
 
 def _without_nan(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ Arrays are ``(time, channel)``; stacked over runs they are ``(sample, channel)``
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, missing, printable
-from dfsm.numerics.time_mesh import time_step
+from dfsm.numerics.time_mesh import own_interval, time_step
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -108,6 +109,7 @@ class Trajectory:
             )
         if len(time) < 2:
             raise DfsmError(f"{self.where}: {len(time)} samples, at least 2 are needed")
+        time = _apart(time, values)
         _check_time(time, self.where)
         counts: dict[str, int] = {}
         for c in self.channels:
@@ -252,14 +254,43 @@ class Trajectory:
             wall_time=None if self.wall_time is None else self.wall_time * part,
         )
 
-    def with_channels(self, channels: Sequence[Channel], values: ArrayLike) -> Trajectory:
-        """Append channels; `values` has shape ``(time, len(channels))``."""
-        values = np.asarray(values, dtype=np.float64).reshape(len(self), len(channels))
-        return replace(
-            self,
-            values=np.concatenate([self.values, values], axis=1),
-            channels=(*self.channels, *channels),
-        )
+    def with_channels(
+        self,
+        channels: Sequence[Channel | str] | Channel | str,
+        values: ArrayLike,
+        *,
+        replace: bool = False,
+    ) -> Trajectory:
+        """Append channels, or put others in the place of those that the run has.
+
+        Parameters
+        ----------
+        channels
+            Channels, or names: a channel of the run then keeps its unit and role.
+        values
+            Samples, shape ``(time, len(channels))``, or one number for all times.
+        replace
+            Whether channels that the run has are replaced; they are refused otherwise.
+
+        Raises
+        ------
+        DfsmError
+            Another shape, what is no channel or number, or a name that is taken.
+        """
+        added = _described(self, channels)
+        taken = [c.name for c in added if c.name in self]
+        if taken and not replace:
+            raise DfsmError(
+                f"{self.where}: channel '{taken[0]}' stands there twice: rename one, or replace "
+                "it with replace=True"
+            )
+        values = np.concatenate([self.values, _samples(self, values, added)], axis=1)
+        every = (*self.channels, *added)
+        columns = list(range(len(every)))
+        if taken:  # a name keeps its first place and takes its last column
+            columns = list({c.name: i for i, c in enumerate(every)}.values())
+            values = values[:, columns]
+        return dataclasses.replace(self, values=values, channels=tuple(every[i] for i in columns))
 
     def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
         """Set the roles of the named channels; the others keep theirs."""
@@ -280,6 +311,14 @@ class Trajectory:
         if bad.any():
             column = int(np.flatnonzero(bad.any(axis=0))[0])
             rows = np.flatnonzero(bad[:, column])
+            interval = own_interval(self.time, ~bad[:, column])
+            if interval is not None:
+                name = self.names[column]
+                raise DfsmError(
+                    f"{self.where}: channel '{name}' has one sample every {interval:g} s, fewer "
+                    "than its table has rows: say what it does in between with data.slower: "
+                    f"{{{name}: hold}} or linear (in Python: FitSettings.slower, fill_slower)"
+                )
             raise DfsmError(
                 f"{self.where}: channel '{self.names[column]}' has {len(rows)} NaN or infinite "
                 f"samples, the first at {self.time[rows[0]]:g} s: leave the channel or that part "
@@ -363,6 +402,50 @@ class Trajectory:
             raise DfsmError(f"{where}: the index is not time in s; set it to the time") from None
         channels = tuple(Channel(str(c), known.get(str(c), "")) for c in frame.columns)
         return cls(time, np.stack(columns, axis=1), channels, name=name, source=source)
+
+
+def _described(run: Trajectory, channels: Sequence[Channel | str] | Channel | str) -> list[Channel]:
+    listed = [channels] if isinstance(channels, Channel | str) else list(channels)
+    for c in listed:
+        if not isinstance(c, Channel | str):
+            raise DfsmError(f"{run.where}: {c!r} is no channel: give a Channel, or its name")
+    names = [c if isinstance(c, str) else c.name for c in listed]
+    # New samples do not lie on the grid of those that a file held.
+    known = {n: replace(run.channel(n), step=None) for n in names if n in run}
+    return [known.get(c, Channel(c)) if isinstance(c, str) else c for c in listed]
+
+
+def _samples(run: Trajectory, values: ArrayLike, channels: Sequence[Channel]) -> Array:
+    """Samples of some channels, ``(time, channel)``."""
+    shape, told = (len(run), len(channels)), ", ".join(c.name for c in channels)
+    try:
+        samples = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DfsmError(
+            f"{run.where}: the samples of {told} are no numbers: give numbers"
+        ) from None
+    if samples.ndim and samples.size != shape[0] * shape[1]:
+        raise DfsmError(
+            f"{run.where}: the samples of {told} have shape {samples.shape}, expected {shape}, or "
+            "one number"
+        )
+    return samples.reshape(shape) if samples.ndim else np.full(shape, samples)
+
+
+def _apart(time: Array, values: Array) -> Array:
+    """Move the second of two samples at one time on by the smallest step there is.
+
+    An event is written as two samples, before and after inputs jump; what does not jump is the same
+    in both. Two samples that have nothing in common, three at one time, or copies of samples in a
+    run without events are something else.
+    """
+    rows = np.flatnonzero(np.diff(time) == 0) + 1
+    same = values[rows] == values[rows - 1]
+    if same.all():
+        return time
+    pairs = rows[(np.diff(rows, prepend=-2) > 1) & same.any(axis=1)]
+    time[pairs] = np.nextafter(time[pairs], np.inf)
+    return time
 
 
 def _check_time(time: Array, where: str) -> None:

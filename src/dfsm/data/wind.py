@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+from dfsm.core.units import factor
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -32,11 +33,11 @@ def undisturbed_rotor_wind(
     hub_height
         Height of the hub above the centre of pitching, in m.
     wind
-        Relative wind channel, in m/s.
+        Relative wind channel, in m/s or another unit of a speed.
     rate
-        Platform pitch rate channel, in deg/s or rad/s.
+        Platform pitch rate channel, in deg/s, rad/s or the like.
     name
-        Name of the new channel, in m/s.
+        Name of the new channel, in the wind's unit.
 
     Returns
     -------
@@ -55,17 +56,18 @@ def undisturbed_rotor_wind(
     if name in trajectory:
         raise DfsmError(f"{trajectory.where}: channel '{name}' exists already: give another name")
     source, motion = (trajectory.channels[i] for i in trajectory.columns((wind, rate)))
-    if source.unit not in ("m/s", "m/sec"):
+    metres = factor(source.unit, "m/s")
+    if metres is None:
         raise DfsmError(
             f"{trajectory.where}: '{wind}' is in '{source.unit}', expected m/s: convert it first"
         )
-    to_rad = {"deg/s": math.pi / 180, "deg/sec": math.pi / 180, "rad/s": 1.0, "rad/sec": 1.0}
-    if motion.unit not in to_rad:
+    radians = factor(motion.unit, "rad/s")
+    if radians is None:
         raise DfsmError(
             f"{trajectory.where}: '{rate}' is in '{motion.unit}', expected deg/s or rad/s: "
             "convert it first"
         )
-    arm = hub_height * to_rad[motion.unit]
+    arm = hub_height * radians / metres
     step = None
     if source.step is not None and motion.step is not None:
         step = math.hypot(source.step, arm * motion.step)

@@ -14,10 +14,12 @@ The azimuth of OpenFAST turns the other way: at azimuth ψ, blade 1 is at α = -
 from __future__ import annotations
 
 import re
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from numpy.typing import NDArray
 from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory, labels
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, DfsmWarning
 
 PLANE = ("RotWind", "RotShearV", "RotShearH")
 DISK = ("U_disk", "U_cubic")
@@ -42,6 +44,9 @@ _FEWEST_POINTS = 9
 # run and its own field: 1.00, another field: 0.77 at most. Hub and average around 15 m: 0.71 at
 # least, another field 0.60 at most. The hub and the average over the disk do not tell: 0.41, 0.63.
 _SAME = 0.9
+# Shares of the stated mean wind by which shear and chance move the mean over the disk, and from
+# which on it is another wind.
+_SAME_MEAN, _OTHER_MEAN = 0.03, 0.25
 _POINT_AND_RING = 0.65
 
 
@@ -84,6 +89,22 @@ class WindField(ABC):
     @abstractmethod
     def blocks(self) -> Iterator[Array]:
         """Longitudinal wind in m/s in parts of shape ``(time, z, y)``, `BLOCK` steps each."""
+
+    def at_hub(self, height: float) -> Self:
+        """The same field seen from a hub at another height in m than the field states.
+
+        Raises
+        ------
+        DfsmError
+            It is not within the field.
+        """
+        low, high = float(self.z[0]), float(self.z[-1])
+        if not low < height < high:
+            raise DfsmError(
+                f"{self.path}: a hub at {height:g} m is not within the field, which covers heights "
+                f"of {low:g} to {high:g} m: give the hub's height in m, or another field"
+            )
+        return replace(self, hub_height=float(height))
 
     @property
     def reach(self) -> float:
@@ -139,7 +160,13 @@ def field_signals(
     Raises
     ------
     DfsmError
-        The disk or a ring reaches beyond the field, or a number makes no sense.
+        The disk or a ring reaches beyond the field, a number makes no sense, or the mean over the
+        disk is more than a quarter from what the field states.
+
+    Warns
+    -----
+    DfsmWarning
+        They differ by more than shear and chance make.
     """
     if not 0 <= harmonics < _AROUND // 2:
         raise DfsmError(f"{harmonics} harmonics were asked for, expected 0 to {_AROUND // 2 - 1}")
@@ -159,8 +186,26 @@ def field_signals(
             columns += [over.mean(axis=1, keepdims=True), np.cbrt((over**3).mean(axis=1))[:, None]]
         parts.append(np.concatenate([*columns, u @ hub], axis=1))
     channels = tuple(Channel(n, "m/s", role="disturbance") for n in (*names, "hub"))
+    values = np.concatenate(parts)
+    _check_mean(field, float(values[:, 0].mean()))
     time = field.step * np.arange(field.count) - field.delay
-    return Trajectory(time, np.concatenate(parts), channels, field.path.stem, str(field.path))
+    return Trajectory(time, values, channels, field.path.stem, str(field.path))
+
+
+def _check_mean(field: WindField, mean: float) -> None:
+    stated = field.mean_wind
+    if not abs(mean - stated) <= _OTHER_MEAN * stated:
+        raise DfsmError(
+            f"{field.path}: the wind over the disk is {mean:.4g} m/s on average, the field states "
+            f"{stated:.4g} m/s and moves with it: give the field with its mean in it"
+        )
+    if abs(mean - stated) > _SAME_MEAN * stated:
+        warnings.warn(
+            f"{field.path}: the wind over the disk is {mean:.5g} m/s on average, the field states "
+            f"{stated:.5g} m/s: the wind is taken as it is, and moves as stated",
+            DfsmWarning,
+            stacklevel=3,
+        )
 
 
 def ring_radii(radius: float) -> tuple[float, ...]:

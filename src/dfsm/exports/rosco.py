@@ -6,6 +6,8 @@ at work, so that a horizon which begins at 100 s leaves 100 s for the turbine to
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +18,50 @@ from dfsm.control.solution import Solution
 from dfsm.core.files import write_file
 from dfsm.core.settings import require
 from dfsm.core.types import Array
-from dfsm.core.units import ANGLES, TORQUES, plain
+from dfsm.core.units import factor
+from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.errors import DfsmError, near_matches, printable
+from dfsm.errors import DfsmError, DfsmWarning, near_matches, printable
+from dfsm.exports.rosco_limits import (
+    CUTS,
+    broken,
+    negative_torque,
+    pitch_needs,
+    read_numbers,
+)
 
 # More rows than this are a mistyped step.
 _MOST_ROWS = 1_000_000
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What a control may be to ROSCO: the names and the unit by which it is known."""
+
+    what: str
+    counterpart: str
+    names: re.Pattern[str]
+    examples: str
+    unit: str
+    expected: str
+
+
+_PITCH = _Kind(
+    what="pitch",
+    counterpart="torque",
+    names=re.compile(r"Bl(d|ade)?_?Pitch(C|Com|Cmd)?_?\d?|PtchPMz[bc]\d", re.IGNORECASE),
+    examples="BldPitch1, BlPitchC1, PtchPMzc1",
+    unit="rad",
+    expected="an angle (rad or deg)",
+)
+_TORQUE = _Kind(
+    what="torque",
+    counterpart="pitch",
+    names=re.compile(r"Gen(erator)?_?(Tq|Trq|Torq|Torque)(C|Com|Cmd)?", re.IGNORECASE),
+    examples="GenTq",
+    unit="N m",
+    expected="a torque (N m, kN m or MN m)",
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +79,8 @@ class RoscoInput:
         column is then left out.
     discon
         Lines to set in ROSCO's DISCON file, value by name.
+    notes
+        What ROSCO does to the file that these lines do not show, a sentence each.
     """
 
     path: Path
@@ -46,13 +88,14 @@ class RoscoInput:
     pitch: str | None
     torque: str | None
     discon: Mapping[str, str]
+    notes: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """What to set, for people."""
         lines = ["DISCON.IN of ROSCO:"]
         lines += [f"  {value:<20} ! {name}" for name, value in self.discon.items()]
         lines.append("ServoDyn input file (ROSCO 2.10 gives every blade its pitch):")
-        return [*lines, f"  {'1':<20} ! Ptch_Cntrl"]
+        return [*lines, f"  {'1':<20} ! Ptch_Cntrl", *self.notes]
 
 
 def write_rosco(
@@ -63,6 +106,7 @@ def write_rosco(
     torque: str | None = None,
     scenario: int = 1,
     step: float | None = None,
+    discon: str | Path | None = None,
 ) -> RoscoInput:
     """Write optimal controls as an open-loop input file of ROSCO.
 
@@ -73,13 +117,17 @@ def write_rosco(
     path
         File to write: time in s, collective pitch in rad, generator torque in N m.
     pitch, torque
-        Controls to take; None takes the only one whose unit is an angle (rad, deg), and the only
-        one whose unit is a torque (N m, kN m, MN m).
+        Controls to take, in a unit of an angle or of a torque; None takes the one whose name says
+        what it is (BldPitch1, BlPitchC1, PtchPMzc1; GenTq). With one of the two given and no such
+        name for the other, that one is left out.
     scenario
         Which one, counted from 1.
     step
         Time between rows in s, the controls in between by the scheme's polynomials; None writes
         the nodes of the solution.
+    discon
+        DISCON.IN that the file is to be flown with: every limit of it that the file breaks is told
+        in `notes`, and limits that are wide enough are left as they are.
 
     Returns
     -------
@@ -88,15 +136,21 @@ def write_rosco(
     Raises
     ------
     DfsmError
-        The solve did not succeed, no control is a pitch or a torque, units that are unknown, or a
-        file that cannot be written.
+        The solve did not succeed, no control is a pitch or a torque, a name that does not tell
+        which, units of something else, or a file that cannot be written.
+
+    Warns
+    -----
+    DfsmWarning
+        The torque is negative somewhere, which ROSCO makes 0.
     """
+    known = None if discon is None else read_numbers(discon)
     if not solution.solved:
         raise DfsmError(f"{printable(solution.name)} was not solved: {solution.message}")
     run = _controls(solution, scenario, step)
     chosen = {
-        "pitch": _chosen(run, "pitch", "an angle (rad or deg)", pitch, ANGLES),
-        "torque": _chosen(run, "torque", "a torque (N m, kN m or MN m)", torque, TORQUES),
+        "pitch": _chosen(run, _PITCH, pitch, torque),
+        "torque": _chosen(run, _TORQUE, torque, pitch),
     }
     if chosen["pitch"] is None and chosen["torque"] is None:
         told = ", ".join(f"{c.name} in '{c.unit}'" for c in run.channels) or "none"
@@ -107,21 +161,58 @@ def write_rosco(
     columns, heads, number = [run.time], ["Time (s)"], dict.fromkeys(chosen, 0)
     for what, control in chosen.items():
         if control is not None:
-            channel, factor = control
-            columns.append(factor * run[channel.name])
-            heads.append(f"{channel.name} ({'rad' if what == 'pitch' else 'N m'})")
+            unit = "rad" if what == "pitch" else "N m"
+            taken = in_units_of(run, [Channel(control.name, unit)], "ROSCO")
+            columns.append(taken[control.name])
+            heads.append(f"{control.name} ({unit})")
             number[what] = len(columns)
+    rows = dict(zip(("time", *(w for w in chosen if chosen[w] is not None)), columns, strict=True))
     path = Path(path)
     _write(path, solution.name, heads, np.column_stack(columns))
-    names = {what: None if control is None else control[0].name for what, control in chosen.items()}
-    discon = {
+    names = {what: None if control is None else control.name for what, control in chosen.items()}
+    lines = {
         "OL_Mode": "1",
         "OL_Filename": f'"{path.name}"',
         "Ind_Breakpoint": "1",
         "Ind_BldPitch": " ".join(3 * [str(number["pitch"])]),
         "Ind_GenTq": str(number["torque"]),
     }
-    return RoscoInput(path, len(run), names["pitch"], names["torque"], discon)
+    more, notes = _limits(solution, rows, known)
+    return RoscoInput(path, len(run), names["pitch"], names["torque"], lines | more, notes)
+
+
+def _limits(
+    solution: Solution, rows: Mapping[str, Array], known: Mapping[str, float] | None
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Lines of DISCON.IN that let the file pass, and what they do not show."""
+    time, pitch, torque = (rows.get(k) for k in ("time", "pitch", "torque"))
+    assert time is not None
+    lines, notes = {}, [CUTS]
+    if pitch is not None:
+        lines["PC_ControlMode"] = "1"
+        actuator = [c.name for c in solution.trajectory.channels if _is_actuator(c)]
+        if actuator:
+            notes.append(
+                f"the model has {', '.join(actuator)} as a state and so its own pitch actuator: "
+                "leave PA_Mode and what belongs to it as the model has it"
+            )
+        else:
+            lines["PA_Mode"] = "0"
+        for key, needed in pitch_needs(time, pitch).items():
+            own = needed if known is None else known.get(key, needed)
+            wider = min(own, needed) if "Min" in key else max(own, needed)
+            lines[key] = f"{wider:.6g}"
+        if known is None:
+            notes.append("wider limits of the pitch and its rate than these serve as well")
+    if torque is not None and (negative := negative_torque(time, torque)):
+        warnings.warn(f"{printable(solution.name)}: {negative}", DfsmWarning, stacklevel=3)
+        notes.append(negative)
+    return lines, (*notes, *(broken(known, time, pitch, torque) if known is not None else ()))
+
+
+def _is_actuator(channel: Channel) -> bool:
+    """Whether a channel is the pitch that an actuator in the model answers with."""
+    return channel.role == "state" and _PITCH.names.fullmatch(channel.name) is not None
 
 
 def _controls(solution: Solution, scenario: int, step: float | None) -> Trajectory:
@@ -140,24 +231,35 @@ def _controls(solution: Solution, scenario: int, step: float | None) -> Trajecto
     return Trajectory(run.time[0] + since, values, controls.channels, name=run.name)
 
 
-def _chosen(
-    run: Trajectory, what: str, expected: str, name: str | None, units: Mapping[str, float]
-) -> tuple[Channel, float] | None:
-    """The control that is the pitch or the torque, and its unit in rad or N m."""
+def _chosen(run: Trajectory, kind: _Kind, name: str | None, other: str | None) -> Channel | None:
+    """The control that is the pitch or the torque.
+
+    A unit tells what a control is not, and never what it is: yaw is an angle, too.
+    """
     if name is not None:
         if name not in run:
-            raise DfsmError(f"{what}: no control '{name}'; {near_matches(name, run.names)}")
-        known = [run.channel(name)]
-        if plain(known[0].unit) not in units:
-            raise DfsmError(f"{what}: '{name}' is in '{known[0].unit}', expected {expected}")
-    else:
-        known = [c for c in run.channels if plain(c.unit) in units]
-    if len(known) > 1:
+            raise DfsmError(f"{kind.what}: no control '{name}'; {near_matches(name, run.names)}")
+        if factor(run.channel(name).unit, kind.unit) is None:
+            raise DfsmError(
+                f"{kind.what}: '{name}' is in '{run.channel(name).unit}', expected {kind.expected}"
+            )
+        return run.channel(name)
+    possible = [c for c in run.channels if factor(c.unit, kind.unit) is not None]
+    known = [c for c in possible if kind.names.fullmatch(c.name)]
+    if len(known) == 1 or not possible or (other is not None and not known):
+        return known[0] if known else None
+    named = " or ".join(c.name for c in known or possible)
+    if known:
         raise DfsmError(
-            f"the {what} may be {' or '.join(c.name for c in known)}, all in units of {expected}: "
-            f"name one with --{what}, or {what}= in Python"
+            f"the {kind.what} may be {named}, all in units of {kind.expected}: name one with "
+            f"--{kind.what}, or {kind.what}= in Python"
         )
-    return (known[0], units[plain(known[0].unit)]) if known else None
+    raise DfsmError(
+        f"{named} in '{possible[0].unit}' has no name by which ROSCO's {kind.what} is known "
+        f"({kind.examples}), and {kind.expected} may be something else: name the control with "
+        f"--{kind.what} ({kind.what}= in Python), or only the {kind.counterpart} with "
+        f"--{kind.counterpart}"
+    )
 
 
 def _write(path: Path, name: str, heads: list[str], values: Array) -> None:

@@ -24,17 +24,20 @@ from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.readers.rotor_table import RotorTable
+from dfsm.data.steps import Slopes
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
-from dfsm.fitting.contraction import contraction
+from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
-from dfsm.fitting.gate import correct
+from dfsm.fitting.doubts import Doubts, doubts
+from dfsm.fitting.gate import correct, predicted
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
+from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
-from dfsm.fitting.samples import Samples, data_warnings, extract, select
+from dfsm.fitting.samples import Samples, extract, select
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.stabilize import stabilise
 from dfsm.models.corrective import Corrective
@@ -43,12 +46,8 @@ from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
 from dfsm.models.stability import destabilised
+from dfsm.numerics.time_mesh import mean_over, std_over
 from dfsm.refinement.refine import RefineSettings, refine
-from dfsm.simulation.simulate import Status, simulate
-
-# Training runs that are simulated to check a new model, and those of them along which pairs of
-# rollouts from different initial states are followed.
-_CHECK_RUNS, _PAIRED_RUNS = 8, 3
 
 
 @dataclass(frozen=True)
@@ -114,10 +113,14 @@ def fit(
     with _timed(seconds, "derivatives"):
         samples = extract(data, settings)
     with _timed(seconds, "linear fit"):
-        f = _fit_derivatives(samples, settings)
+        rows, samples = over_intervals(samples, lambda rows: _fit_slopes(rows, settings))
+        f = _fit_derivatives(rows, settings)
+    with _timed(seconds, "doubts"):
+        residuals = rows.derivatives - predicted(f.model, rows.linear_inputs)
+        doubt = doubts(rows, f, residuals, settings)
     with _timed(seconds, "corrective functions"):
         later = refinement is not None and refinement.network > 0
-        e = correct(samples, samples.linear_inputs, samples.derivatives, f, settings, later)
+        e = correct(rows, rows.linear_inputs, rows.derivatives, f, settings, later)
     region = region_of(samples, f.model, data)
     model = DFSM(
         f=f.model,
@@ -133,10 +136,19 @@ def fit(
     if settings.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     recorded = seen = samples
+    discarded: list[str] = []
     if refinement is not None:
         with _timed(seconds, "refinement"):
             window = {"start": settings.start, "stop": settings.stop}
-            model = refine(model, data, refinement, **window, seed=settings.seed).model
+            with hushed():  # told with the other warnings
+                refined = refine(model, data, refinement, **window, seed=settings.seed)
+            model = refined.model
+            if refined.improved:
+                doubt = replace(doubt, notes=(), outdated=True)
+            else:
+                discarded.append(refined.message)
+                account = {"message": refined.message, "improved": False}
+                model = replace(model, provenance=Provenance({"refinement": account}))
             recorded = with_latents(model, data, samples, settings)
             recorded = replace(recorded, terms=model.terms)
             seen = along_rollouts(model, data, recorded, settings)
@@ -156,25 +168,27 @@ def fit(
         else:
             more = unexplained(model, seen)
     with _timed(seconds, "checks"):
-        notes, checks = _check(model, recorded, data, settings)
+        notes, checks, judged = check(model, recorded, data, settings, doubt)
         notes += more
-    notes = [*dict.fromkeys((*f.warnings, *(g.warnings if g else ()))), *notes]
-    checks = [*f.notes, *checks]
+    known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
+    notes = list(dict.fromkeys(known))
+    checks = [*_inputs_told(samples, settings), *f.notes, *checks]
     nonlinear = None
     if settings.nonlinear_only and not isinstance(settings.corrective, NoCorrection):
         with _timed(seconds, "nonlinear-only"):
-            nonlinear = _fit_nonlinear(samples, region, settings)
+            nonlinear = _fit_nonlinear(samples, rows, region, settings)
             if nonlinear.signals.field:
                 nonlinear, *_ = fit_passing(nonlinear, samples, data)
     outputs = e_g.decisions if e_g else []
     for row, account in zip(outputs, passing, strict=False):
         row["passing"] = account["explained"]
         row["decision"] += f"; {account['text']}"
-    decisions = [*e.decisions, *outputs]
+    decisions = [*_with_coefficients(e.decisions, samples, f, doubt), *outputs]
     record = dict(model.provenance.record) | _record(
         data, settings, f, decisions, notes, checks, seconds
     )
-    for text in notes:
+    record |= judged
+    for text in (*discarded, *notes):
         warnings.warn(text, DfsmWarning, stacklevel=2)
     model = replace(model, provenance=Provenance(record))
     if nonlinear is not None:
@@ -201,14 +215,13 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
             result, columns, kinematic, settings.linear.margin, settings.linear.affine, slopes
         )
         names = [samples.derivative_names[i][0] for i in fitted]
-        result = replace(
-            result, notes=_account(settings, moved, names, before, result.residual_rms)
-        )
+        account = _account(settings, moved, names, before, result.residual_rms)
+        result = replace(result, notes=account, moved=tuple(moved))
     points, _, n_inputs = result.model.coefficients.shape
     L = np.zeros((points, samples.derivatives.shape[1], n_inputs))
     b = np.zeros(L.shape[:2])
     L[:, fitted], b[:, fitted] = result.model.coefficients, result.model.offsets
-    rms, std = np.zeros(L.shape[1]), samples.derivatives.std(axis=0)
+    rms, std = np.zeros(L.shape[1]), std_over(samples.derivatives, samples.weights)
     rms[fitted] = result.residual_rms
     for row, rate in kinematic.items():
         L[:, row, columns.start + rate] = 1.0
@@ -220,6 +233,29 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
         tuple((fitted[row], column) for row, column in result.model.known),
     )
     return replace(result, model=model, residual_rms=rms, target_std=std)
+
+
+def _fit_slopes(rows: Samples, settings: FitSettings) -> Slopes:
+    """The linear fit of ξ̇ alone, as a function of I."""
+    model = _fit_derivatives(rows, settings).model
+    return lambda inputs: predicted(model, replace(rows, inputs=inputs).linear_inputs)
+
+
+def _inputs_told(samples: Samples, settings: FitSettings) -> tuple[str, ...]:
+    """Which inputs were recognised as held, and what to set where they are not."""
+    names = samples.signals.driving
+    chosen = settings.inputs or {}
+    if isinstance(chosen, str):
+        return ()
+    kinds = zip(names, samples.signals.between, strict=True)
+    held = [name for name, kind in kinds if kind == "hold" and name not in chosen]
+    if not held:
+        return ()
+    which = ", ".join(held)
+    return (
+        f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
+        f"samples (for lines set inputs: {{{held[0]}: linear}})",
+    )
 
 
 def _account(
@@ -274,29 +310,30 @@ def _linear(
                 f"choose one of {', '.join(names)}"
             )
         column = names.index(settings.linear.schedule)
-        windows = schedule_windows(inputs[:, column], settings.linear.points)
-    return fit_linear(samples.blocks(inputs, targets), names, settings.linear, windows, known)
+        windows = schedule_windows(inputs[:, column], settings.linear.points, samples.weights)
+    blocks = samples.weighted_blocks(inputs, targets)
+    return fit_linear(blocks, names, settings.linear, windows, known)
 
 
 # -- nonlinear-only, for comparison --------------------------------------------------------------
 
 
-def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> DFSM:
+def _fit_nonlinear(samples: Samples, rows: Samples, region: Region, settings: FitSettings) -> DFSM:
     """f̂_NL: the same corrective function for every row, and nothing linear under it."""
 
-    def part(inputs: Array, targets: Array) -> tuple[LinearModel, Corrective | None]:
-        mean = targets.mean(axis=0)
+    def part(of: Samples, inputs: Array, targets: Array) -> tuple[LinearModel, Corrective | None]:
+        mean = mean_over(targets, of.weights)
         trained = fit_corrective(
-            inputs, targets - mean, samples.runs, settings.corrective, settings.seed
+            inputs, targets - mean, of.runs, settings.corrective, settings.seed, of.weights
         )
         if trained is None:
             raise ValueError("nothing to fit")
         zero = jnp.zeros((1, targets.shape[1], inputs.shape[1]))
         return LinearModel(jnp.zeros(1), zero, jnp.asarray(mean)[None], None), trained.function
 
-    f, e = part(samples.inputs, samples.derivatives)
+    f, e = part(rows, rows.inputs, rows.derivatives)
     inputs = samples.without_terms(samples.output_inputs)
-    g, e_g = part(inputs, samples.outputs) if settings.outputs else (None, None)
+    g, e_g = part(samples, inputs, samples.outputs) if settings.outputs else (None, None)
     return DFSM(
         f=f,
         e=e,
@@ -309,60 +346,25 @@ def _fit_nonlinear(samples: Samples, region: Region, settings: FitSettings) -> D
     )
 
 
-def _check(
-    model: DFSM, samples: Samples, data: Dataset, settings: FitSettings
-) -> tuple[list[str], list[str]]:
-    """Look for what would surprise a user: non-finite values, instability, leaking disturbances.
-
-    Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
-    """
-    notes = data_warnings(data, settings, samples)
-    x, u, w, p = model.split(samples.inputs)
-    values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
-    if not np.isfinite(values).all():
-        raise DfsmError(
-            "the fitted model is not finite on its own training samples: fewer "
-            "corrective.samples, or another corrective.kind, may cure it"
-        )
-    unstable = [(s, v.real.max()) for s, v in model.eigenvalues() if v.real.max() > 0]
-    if unstable:
-        points = ", ".join(f"{s:.4g}" for s, _ in unstable)
-        where = f"{model.schedule} = {points}" if model.schedule else "its only point"
-        notes.append(
-            f"the linear fit is unstable at {where} (fastest growth "
-            f"{max(v for _, v in unstable):.3g} 1/s): right for an unstable system; for any "
-            "other set linear.margin, or expect rollouts to drift off"
-        )
-    some = [data[i] for i in np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int))]
-    with hushed():
-        rollouts = simulate(model, some, start=settings.start, stop=settings.stop)
-    done = sum(r.status is Status.COMPLETED for r in rollouts)
-    checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]
-    if done < len(some):
-        worst = min(
-            (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended
-        )
-        notes.append(f"only {checks[0]}; {worst.trajectory.name}: {worst.reason}")
-    few = slice(None, None, -(-len(some) // _PAIRED_RUNS))
-    outcome = contraction(model, some[few], rollouts[few], settings.start, settings.stop)
-    if outcome is not None:
-        checks.append(outcome.account)
-        if outcome.unexpected:
-            notes.append(f"{outcome.account}, although {_unexpected(model)}")
-    return notes, checks
-
-
-def _unexpected(model: DFSM) -> str:
-    """What ought to have made states come together, and what to do where it did not."""
-    if model.schedule:
-        return (
-            f"every linear fit is stable with {model.schedule} frozen: as it moves, the model is "
-            "not; use fewer linear.points, a larger linear.margin or another linear.schedule"
-        )
-    return (
-        "the linear fit is stable: right for a system with several equilibria; for any other set "
-        "linear.margin, or correct less (gate, corrective)"
-    )
+def _with_coefficients(
+    decisions: list[dict[str, Any]], samples: Samples, f: LinearFit, doubt: Doubts
+) -> list[dict[str, Any]]:
+    """The decisions on derivatives with the linear fit's mean coefficients and their errors."""
+    if doubt.outdated:
+        return decisions
+    names = samples.linear_names
+    return [
+        d
+        if np.isnan(errors).all()
+        else d
+        | {
+            "coefficients": [
+                (name, float(value), float(error) if np.isfinite(error) else None)
+                for name, value, error in zip(names, row, errors, strict=True)
+            ]
+        }
+        for d, row, errors in zip(decisions, f.mean_coefficients, doubt.errors, strict=True)
+    ]
 
 
 def _told(settings: FitSettings) -> list[dict[str, Any]]:

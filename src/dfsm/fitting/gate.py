@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.core.types import Array, IntArray
+from dfsm.core.types import Array
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.fitting.corrective import CorrectiveFit, fit_corrective
 from dfsm.fitting.linear import LinearFit
@@ -19,6 +19,7 @@ from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
+from dfsm.numerics.time_mesh import mean_over, std_over
 
 # A correction is kept if it explains at least this share of the residual's variance on runs left
 # out of training. Less than that is within what cross-validation finds in noise, and may undo what
@@ -81,8 +82,9 @@ def correct(
     -------
     Correction
     """
-    residuals = targets - _predict(linear.model, samples, inputs, targets)
-    rms, std = np.sqrt(np.mean(residuals**2, axis=0)), targets.std(axis=0)
+    residuals = targets - predict(linear.model, samples, inputs, targets)
+    rms = np.sqrt(mean_over(residuals**2, samples.weights))
+    std = std_over(targets, samples.weights)
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     derivatives = targets is samples.derivatives
     known = kinematic_rows(settings.states) if derivatives else {}
@@ -90,7 +92,7 @@ def correct(
     hidden, trained = linear.model.known_among(samples.inputs.shape[1]), None
     if large and not later:
         inputs = samples.without_terms(inputs)
-        trained = _train(inputs, residuals[:, large], hidden, samples.runs, settings)
+        trained = _train(inputs, residuals[:, large], hidden, samples, settings)
     function, explained, detail = None, dict[int, float](), ""
     if trained is not None:
         explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
@@ -138,7 +140,7 @@ def _train(
     inputs: Array,
     residuals: Array,
     hidden: Sequence[int],
-    runs: IntArray,
+    samples: Samples,
     settings: FitSettings,
 ) -> CorrectiveFit | None:
     """Train on inputs of which some, whose effect physics gave, are held at their mean."""
@@ -146,14 +148,20 @@ def _train(
     if hidden:
         columns = list(hidden)
         seen = inputs.copy()
-        seen[:, columns] = inputs[:, columns].mean(axis=0)
-    return fit_corrective(seen, residuals, runs, settings.corrective, settings.seed)
+        seen[:, columns] = mean_over(inputs[:, columns], samples.weights)
+    runs, weights = samples.runs, samples.weights
+    return fit_corrective(seen, residuals, runs, settings.corrective, settings.seed, weights)
 
 
-def _predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
-    """Evaluate the linear fit run by run, so that memory stays bounded."""
+def predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """The linear fit of some targets ``(sample, target)``, run by run to bound memory."""
     parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
     return np.concatenate([np.asarray(p) for p in parts])
+
+
+def predicted(model: LinearModel, inputs: Array) -> Array:
+    """A linear fit at what it takes, ``(sample, input)`` to ``(sample, target)``."""
+    return np.asarray(_apply(model, inputs))
 
 
 @eqx.filter_jit

@@ -34,6 +34,10 @@ from dfsm.numerics.least_squares import (
     merge,
     shared_coefficients,
 )
+from dfsm.numerics.time_mesh import quantiles_over
+
+# Inputs, targets and weights of some samples.
+Block = tuple[Array, Array, Array | None]
 
 # Two input directions whose standardised spread differs by more than this cannot be told apart
 # by least squares in 64-bit normal equations with a few digits to spare.
@@ -125,6 +129,8 @@ class LinearFit:
         Sentences that name inputs which do not vary or which the data cannot tell apart.
     notes
         What was done to the fit afterwards, and what it cost.
+    moved
+        Schedule points at which eigenvalues were moved: no fit of least squares any more.
     """
 
     model: LinearModel
@@ -137,9 +143,16 @@ class LinearFit:
     warnings: tuple[str, ...]
     constant: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+    moved: tuple[float, ...] = ()
+
+    @property
+    def mean_coefficients(self) -> Array:
+        """Coefficients over all samples, ``(target, input)``."""
+        share = self.samples / self.samples.sum()
+        return np.einsum("p,prc->rc", share, np.asarray(self.model.coefficients))
 
 
-def schedule_windows(schedule: Array, points: int) -> Array:
+def schedule_windows(schedule: Array, points: int, weights: Array | None = None) -> Array:
     """Overlapping windows of equal width over the range of a schedule, ends included.
 
     The first window starts at the 0.5th percentile and the last ends at the 99.5th, so that
@@ -151,6 +164,8 @@ def schedule_windows(schedule: Array, points: int) -> Array:
         Schedule samples of all runs, shape ``(sample,)``.
     points
         Number of windows.
+    weights
+        Of the samples by the time that they stand for, ``(sample,)``; None takes all alike.
 
     Returns
     -------
@@ -164,7 +179,7 @@ def schedule_windows(schedule: Array, points: int) -> Array:
     """
     if points < 2:
         raise DfsmError(f"linear.points is {points}, an LPV fit needs at least 2: raise it, or LTI")
-    low, high = np.percentile(schedule, [0.5, 99.5])
+    low, high = quantiles_over(schedule, [0.005, 0.995], weights)
     if not high > low:
         raise DfsmError(
             f"the schedule does not vary (always {low:g}): use an LTI fit or another schedule"
@@ -175,7 +190,7 @@ def schedule_windows(schedule: Array, points: int) -> Array:
 
 
 def fit_linear(
-    blocks: Iterable[tuple[Array, Array]],
+    blocks: Iterable[tuple[Array, Array] | Block],
     input_names: Sequence[str],
     settings: LTI | LPV,
     windows: Array | None = None,
@@ -186,8 +201,9 @@ def fit_linear(
     Parameters
     ----------
     blocks
-        Pairs of inputs ``(sample, input)`` and targets ``(sample, target)``, one pair per run or
-        part of one, in the order of time. They are read once and not kept.
+        Inputs ``(sample, input)`` and targets ``(sample, target)`` of a run or part of one, in the
+        order of time, and weights ``(sample,)`` where samples do not count alike. They are read
+        once and not kept.
     input_names
         Names of the input columns, for the schedule and for messages.
     settings
@@ -212,22 +228,25 @@ def fit_linear(
     windows = np.empty((0, 2)) if windows is None or not lpv else windows
     sums: list[NormalEquations] = []
     m, schedule_sums = len(input_names), np.zeros(len(windows))
-    for inputs, targets in blocks:
+    for inputs, targets, *rest in blocks:
+        weights = rest[0] if rest else None
         if not sums:
             width = m + targets.shape[1]
             first = np.concatenate([inputs[:BLOCK].mean(0), targets[:BLOCK].mean(0)])
             shift = first if settings.affine else np.zeros(width)
             sums = [NormalEquations(shift, m) for _ in range(max(1, len(windows)))]
         if not lpv:
-            sums[0].add(inputs, targets)
+            sums[0].add(inputs, targets, weights=weights)
             continue
-        s, correlation = inputs[:, column], _correlation(inputs, targets, sums[0].shift, settings)
+        s = inputs[:, column]
+        correlation = _correlation(inputs, targets, weights, sums[0].shift, settings)
         for k, (low, high) in enumerate(windows):
             inside = (s >= low) & (s <= high)
             # The end windows also take what lies beyond them: no sample is left out.
             inside |= (s < low) & (k == 0) | (s > high) & (k == len(windows) - 1)
-            sums[k].add(inputs[inside], targets[inside], correlation)
-            schedule_sums[k] += s[inside].sum()
+            w = None if weights is None else weights[inside]
+            sums[k].add(inputs[inside], targets[inside], correlation, w)
+            schedule_sums[k] += s[inside].sum() if w is None else w @ s[inside]
     _check_counts(sums, windows, settings)
     whole = merge(sums).solve(settings.affine)
     known = known or {}
@@ -237,8 +256,8 @@ def fit_linear(
         shared = shared_coefficients(sums, constant, settings.affine, by_place)
         whole = merge(sums).holding(whole, constant, shared, settings.affine)
     solutions = [e.solve(settings.affine, whole, constant) for e in sums] if lpv else [whole]
-    counts = np.array([e.count for e in sums])
-    grid = schedule_sums / counts if lpv else np.zeros(1)
+    counts, mass = np.array([e.count for e in sums]), np.array([e.weight for e in sums])
+    grid = schedule_sums / mass if lpv else np.zeros(1)
     model = LinearModel(
         grid=jnp.asarray(grid),
         coefficients=jnp.asarray(np.stack([s.coefficients for s in solutions])),
@@ -246,11 +265,11 @@ def fit_linear(
         schedule=column,
         known=tuple(known),
     )
-    weights = counts / counts.sum()
+    shares = mass / mass.sum()
     return LinearFit(
         model=model,
         residual_rms=np.sqrt(
-            sum(w * s.residual_variance for w, s in zip(weights, solutions, strict=True))
+            sum(w * s.residual_variance for w, s in zip(shares, solutions, strict=True))
         ),
         target_std=merge(sums).std[m:],
         samples=counts,
@@ -262,7 +281,9 @@ def fit_linear(
     )
 
 
-def _correlation(inputs: Array, targets: Array, shift: Array, settings: LTI | LPV) -> float:
+def _correlation(
+    inputs: Array, targets: Array, weights: Array | None, shift: Array, settings: LTI | LPV
+) -> float:
     """How many samples of a block count as one: all, where it is too short to tell.
 
     The target whose residual remembers longest decides for all. In a second derivative, vibration
@@ -271,9 +292,14 @@ def _correlation(inputs: Array, targets: Array, shift: Array, settings: LTI | LP
     if len(inputs) <= 2 * inputs.shape[1]:
         return float(len(inputs))
     own = NormalEquations(shift, inputs.shape[1])
-    own.add(inputs, targets)
+    own.add(inputs, targets, weights=weights)
     fit = own.solve(settings.affine)
     residuals = targets - inputs @ fit.coefficients.T - fit.offset
+    if weights is not None:
+        # As many samples again, at equal distances in time.
+        ends = np.cumsum(weights)
+        even = np.linspace(ends[0], ends[-1], len(ends))
+        residuals = np.stack([np.interp(even, ends, r) for r in residuals.T], axis=1)
     return float(correlation_length(residuals).max())
 
 

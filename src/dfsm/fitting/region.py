@@ -18,6 +18,7 @@ from dfsm.fitting.samples import Samples
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region, squared_distance
 from dfsm.numerics.hats import hats
+from dfsm.numerics.time_mesh import mean_over, quantiles_over, std_over
 
 # Operating points along the schedule: means of the inputs over equally filled bins.
 _OPERATING_POINTS = 12
@@ -30,7 +31,7 @@ _FLOOR = 1e-2
 
 def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     """Ranges, operating points and distances of the training samples of a model."""
-    inputs = samples.inputs
+    inputs, weights = samples.inputs, samples.weights
     # A signal at a limit differs from file to file by its rounding; that is not "outside".
     order = samples.signals.order
     names = order.names
@@ -38,15 +39,16 @@ def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     bins, column = [np.arange(len(inputs))], model.schedule
     if column is not None:
         ranks = np.argsort(inputs[:, column], kind="stable")
-        bins = np.array_split(ranks, _OPERATING_POINTS)
-    operating = np.stack([inputs[rows].mean(axis=0) for rows in bins])
+        bins = _equal_bins(ranks, weights)
+    each = [None if weights is None else weights[rows] for rows in bins]
+    operating = np.stack([mean_over(inputs[b], w) for b, w in zip(bins, each, strict=True)])
     fixed = np.r_[order.columns("disturbances"), order.columns("parameters")]
-    W, reach = whiten(inputs, samples.runs, bins, column, fixed)
+    W, reach = whiten(inputs, samples.runs, bins, column, fixed, weights)
     return Region(
         low=jnp.asarray(inputs.min(axis=0) - steps),
         high=jnp.asarray(inputs.max(axis=0) + steps),
-        mean=jnp.asarray(inputs.mean(axis=0)),
-        std=jnp.asarray(inputs.std(axis=0)),
+        mean=jnp.asarray(mean_over(inputs, weights)),
+        std=jnp.asarray(std_over(inputs, weights)),
         grid=jnp.asarray(operating[:, column or 0]),
         operating=jnp.asarray(operating),
         whitening=jnp.asarray(W / reach),
@@ -55,8 +57,23 @@ def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     )
 
 
+def _equal_bins(ranks: IntArray, weights: Array | None) -> list[IntArray]:
+    """Samples in the order of the schedule, in bins that are filled alike."""
+    if weights is None:
+        return np.array_split(ranks, _OPERATING_POINTS)
+    ends = np.cumsum(weights[ranks])
+    shares = np.arange(1, _OPERATING_POINTS) / _OPERATING_POINTS
+    bins = np.split(ranks, np.searchsorted(ends, shares * ends[-1]))
+    return [rows for rows in bins if len(rows)]
+
+
 def whiten(
-    inputs: Array, runs: IntArray, bins: Sequence[IntArray], schedule: int | None, first: IntArray
+    inputs: Array,
+    runs: IntArray,
+    bins: Sequence[IntArray],
+    schedule: int | None,
+    first: IntArray,
+    weights: Array | None = None,
 ) -> tuple[Array, float]:
     """Matrices that turn deviations from the operating points into distances.
 
@@ -72,6 +89,8 @@ def whiten(
         Input column that schedules.
     first
         Columns that nobody chooses, disturbances and parameters.
+    weights
+        Of the samples, 1 on average, ``(sample,)``; None where all count alike.
 
     Returns
     -------
@@ -80,11 +99,16 @@ def whiten(
         of I at an operating point with mean μ is |W (I − μ)|; its first components depend on the
         columns in `first` alone.
     """
-    std = np.where(inputs.std(axis=0) > 0, inputs.std(axis=0), 1.0)
-    z = (inputs - inputs.mean(axis=0)) / std
+    std = std_over(inputs, weights)
+    std = np.where(std > 0, std, 1.0)
+    z = (inputs - mean_over(inputs, weights)) / std
     order = np.concatenate([first, np.delete(np.arange(z.shape[1]), first)])
     groups = _groups(runs)
-    sums = np.array([[_sums(z[b[groups[b] == k]]) for b in bins] for k in np.unique(groups)])
+
+    def sums_of(rows: IntArray) -> Array:
+        return _sums(z[rows], None if weights is None else weights[rows])
+
+    sums = np.array([[sums_of(b[groups[b] == k]) for b in bins] for k in np.unique(groups)])
     total = sums.sum(axis=0)
     means = total[:, 0, 1:] / total[:, :1, 0]
     grid = means[:, schedule or 0]
@@ -99,7 +123,9 @@ def whiten(
         shares = hats(jnp.asarray(grid), jnp.asarray(z[mine, schedule or 0]))
         squared = squared_distance(*map(jnp.asarray, (z[mine], shares, middles, W)))
         distances.append(np.sqrt(squared))
-    reach = float(np.quantile(np.concatenate(distances), _SHARE))
+    by_group = np.argsort(groups, kind="stable")
+    weights = None if weights is None else weights[by_group]
+    reach = float(quantiles_over(np.concatenate(distances), _SHARE, weights))
     return np.stack([_whitening(s, order) for s in total]) / std, reach
 
 
@@ -110,10 +136,10 @@ def _groups(runs: IntArray) -> IntArray:
     return np.arange(len(runs)) * 4 // len(runs)
 
 
-def _sums(z: Array) -> Array:
+def _sums(z: Array, weights: Array | None) -> Array:
     """[1, z] products summed up, shape ``(1 + input, 1 + input)``."""
     wide = np.concatenate([np.ones((len(z), 1)), z], axis=1)
-    return wide.T @ wide
+    return wide.T @ (wide if weights is None else wide * weights[:, None])
 
 
 def _whitening(sums: Array, order: IntArray) -> Array:

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
+from dfsm.data.between import Between, jumps, polynomials, recognised, resolved
+from dfsm.data.conversion import in_units_of
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
     differentiate,
+    lead_in,
+    require_moving,
     state_names,
     state_units,
 )
 from dfsm.data.info import gap_warning
+from dfsm.data.slower import fill_slower
+from dfsm.data.steps import Steps
+from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
@@ -32,6 +39,7 @@ from dfsm.models.signals import (
     with_computed,
 )
 from dfsm.models.terms import Terms, terms_of
+from dfsm.numerics.time_mesh import same_instant, weights_over_time
 
 # Share by which the recorded azimuth may turn faster or slower than the speed says.
 _SAME_SPEED = 0.05
@@ -58,6 +66,11 @@ class Samples:
         Name and unit of each state derivative.
     terms
         Known terms of the linear fits.
+    weights
+        Of the samples by the time that they stand for, 1 on average, shape ``(sample,)``; None
+        where all count alike, see `weights_over_time`.
+    steps
+        Intervals of every run, for those in which inputs jump.
     """
 
     inputs: Array
@@ -71,6 +84,8 @@ class Samples:
     signals: SignalTable
     derivative_names: tuple[tuple[str, str], ...]
     terms: Terms | None = None
+    weights: Array | None = None
+    steps: tuple[Steps, ...] = ()
 
     @property
     def linear_inputs(self) -> Array:
@@ -103,9 +118,21 @@ class Samples:
 
     def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
         """Samples run by run."""
+        for inside in self._runs():
+            yield inputs[inside], targets[inside]
+
+    def weighted_blocks(
+        self, inputs: Array, targets: Array
+    ) -> Iterator[tuple[Array, Array, Array | None]]:
+        """Samples run by run with their weights."""
+        for inside in self._runs():
+            weights = None if self.weights is None else self.weights[inside]
+            yield inputs[inside], targets[inside], weights
+
+    def _runs(self) -> Iterator[slice]:
         ends = np.flatnonzero(np.diff(self.runs, append=-1)) + 1
         for start, stop in zip([0, *ends[:-1]], ends, strict=True):
-            yield inputs[start:stop], targets[start:stop]
+            yield slice(start, stop)
 
 
 def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
@@ -115,17 +142,23 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     if twice:
         raise DfsmError(f"'{twice[0]}' is a state, which models simulate: leave it out of outputs")
     names = dict.fromkeys(roles)
+    runs = list(runs)
     if settings.azimuth is not None and settings.azimuth.angle is not None:
         names[settings.azimuth.angle] = None
+        angle = [Channel(settings.azimuth.angle, "deg")]
+        runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
+    runs = [fill_slower(r, settings.slower) for r in runs]
+    runs = screened(list(runs), names, settings.outliers, (settings.start, settings.stop))
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
         names.update(dict.fromkeys(settings.azimuth.field))
         for run in runs:
             require_field(run, settings.azimuth)
-    picked = [r.select(names).require_finite().with_roles(roles) for r in runs]
+    picked = [r.select(names).with_roles(roles) for r in runs]
     for run in picked:
         run.window(settings.start, settings.stop)
+        lead_in(run, settings.start, settings.derivatives).require_finite()
     data = Dataset(picked)
     for name in names:
         data.channel(name)
@@ -147,6 +180,12 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     """What a user should know about the data before trusting a fit, one sentence each."""
     doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
     warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
+    for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
+        if values.min() == values.max():
+            warnings.append(
+                f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
+                "model: leave it out, or add runs in which it varies"
+            )
     gaps = [
         f"{run.where}: {text}"
         for run in data
@@ -161,10 +200,14 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
 def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
     signals = _signals(data, settings)
+    steps: list[Steps] = []
+    kinked = "hold" in signals.between or any(same_instant(run.time).any() for run in data)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
-    for run in track(data, "derivatives"):
-        extracted = differentiate(run, settings.states, settings.derivatives)
+    for whole_run in track(data, "derivatives"):
+        run = lead_in(whole_run, settings.start, settings.derivatives)
+        breaks = jumps(run, signals.driving, signals.between)
+        extracted = differentiate(run, settings.states, settings.derivatives, breaks)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
         inside = whole.window(settings.start, settings.stop)
@@ -176,6 +219,10 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         harmonics = np.empty((len(psi), 0))
         if azimuth is not None and not azimuth.rings:
             harmonics = np.asarray(blade_harmonics(psi, azimuth.blades))
+        if kinked:
+            values = run.select(signals.exogenous).values
+            inputs = polynomials(run.time, values, signals.between_samples())
+            steps.append(Steps.of(extracted, rows, inputs, settings.states, len(signals.driving)))
         parts.append(
             [
                 inside.select(order.names).values,
@@ -188,9 +235,11 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
             ]
         )
     lengths = [len(p[0]) for p in parts]
+    weights = weights_over_time([p[5] for p in parts])
     inputs, derivatives, outputs, harmonics, field, time, psi = (
         np.concatenate(c) for c in zip(*parts, strict=True)
     )
+    require_moving(settings.states, inputs[:, signals.observed_columns])
     return Samples(
         inputs=inputs,
         derivatives=derivatives,
@@ -203,12 +252,15 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         signals=signals,
         derivative_names=labels,
         terms=terms_of(settings.terms, signals.inputs, inputs),
+        weights=weights,
+        steps=tuple(steps),
     )
 
 
 def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
-    # The first run stands for all: `select` has made sure that units agree.
+    # `select` has made sure that units agree; a run may leave out what others state.
     first, names = data[0], state_names(settings.states)
+    first = replace(first, channels=tuple(data.channel(n) for n in first.names))
 
     def channels(names: Iterable[str], role: Role) -> tuple[Channel, ...]:
         return tuple(Channel(n, first.channel(n).unit, role=role) for n in names)
@@ -228,9 +280,17 @@ def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
         hub_height=settings.hub_height,
         features=settings.features,
         field=channels(settings.azimuth.field if settings.azimuth else (), "disturbance"),
+        between=_between(data, settings),
     )
     _ = table.azimuth_rate  # fails here, not in the middle of a simulation
     return table
+
+
+def _between(data: Dataset, settings: FitSettings) -> tuple[Between, ...]:
+    """What inputs do between samples: as chosen, else as it looks in the training data."""
+    names = (*settings.controls, *settings.driving)
+    windows = [run.window(settings.start, settings.stop) for run in data]
+    return resolved(settings.inputs, names, recognised(windows, names))
 
 
 def _azimuth(run: Trajectory, azimuth: Azimuth | None) -> Array:

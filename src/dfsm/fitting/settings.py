@@ -6,8 +6,11 @@ from collections.abc import Iterable
 from dataclasses import field
 
 from dfsm.core.settings import require, settings_class
+from dfsm.data.between import Chosen, resolved
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature
+from dfsm.data.slower import Slower
+from dfsm.data.suspects import SUSPECTS, Suspects
 from dfsm.data.trajectory import Role
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
@@ -31,7 +34,7 @@ class FitSettings:
         Channel names by role. Disturbances are known signals that nobody chooses; none of them
         may hold a response of the system.
     start, stop
-        Time window in s used for training; derivatives are taken on the whole run before.
+        Time window in s used for training; derivatives are taken on a little more, see `lead_in`.
     derivatives
         How derivatives are extracted.
     linear
@@ -49,12 +52,21 @@ class FitSettings:
     hub_height
         In m; adds the channel ``RtVAvgxhCorr``, the rotor wind without the platform's motion, to
         runs that only have ``RtVAvgxh``.
+    slower
+        What channels with fewer samples than their table do in between, see `fill_slower`.
     features
         Disturbances that are computed from others, see `Feature`; they follow those named.
+    inputs
+        What controls and disturbances do between samples: ``"hold"``, ``"linear"`` or ``"cubic"``,
+        for all or by name. Those not named are held where they stay and jump in the training data,
+        else joined by lines.
     nonlinear_only
         Also fit f̂_NL, the same corrective function without a linear part, for comparison.
     seed
         Seed of everything random.
+    outliers
+        What to do with stray samples and runs in another unit: ``"refuse"``, ``"drop"`` or
+        ``"keep"``, see `dfsm.data.suspects.screened`.
     """
 
     states: tuple[StateSpec, ...]
@@ -71,11 +83,16 @@ class FitSettings:
     azimuth: Azimuth | None = None
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()
+    slower: Slower = None
     terms: tuple[TermSettings, ...] = ()
+    inputs: Chosen = field(default=None, hash=False)
     nonlinear_only: bool = True
     seed: int = 0
+    outliers: Suspects = "refuse"
 
     def __post_init__(self) -> None:
+        known = f"one of {', '.join(SUSPECTS)}"
+        require(self.outliers in SUSPECTS, "outliers", self.outliers, known)
         require(self.gate >= 0, "gate", self.gate, "0 or more")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
 
@@ -110,9 +127,14 @@ class FitSettings:
                         f"channel '{name}' is listed as {roles[name]} and as {role}: choose one"
                     )
                 roles.setdefault(name, role)
+        _ = resolved(self.inputs, (*self.controls, *self.driving))
         for feature in self.features:
+            # What acted before now is known; optimal control refuses it, see `acting_late`.
+            free: tuple[Role, ...] = (_DISTURBANCE,)
+            if feature.kind == "delay":
+                free = (_DISTURBANCE, "control")
             source = next(
-                (n for n in feature.sources if roles.get(n, _DISTURBANCE) != _DISTURBANCE), None
+                (n for n in feature.sources if roles.get(n, _DISTURBANCE) not in free), None
             )
             if source is not None:
                 raise DfsmError(

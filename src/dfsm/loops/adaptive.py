@@ -24,6 +24,7 @@ from dfsm.control.solve import solve
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import require, settings_class
+from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, printable
 from dfsm.models.dfsm import DFSM
@@ -227,7 +228,7 @@ def _round(
     problem: OptimalControlProblem, solution: Solution, simulator: Callable[[Solution], Trajectory]
 ) -> Round:
     # Where a surrogate has no feasible point, the last iterate shows the next one what is wrong.
-    run = simulator(solution)
+    run = in_units_of(simulator(solution), solution.trajectory.channels)
     costs = realised(problem, solution, run)
     if not solution.solved:
         return Round(solution, run, costs, np.inf)

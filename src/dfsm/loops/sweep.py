@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from dfsm.controllers.controller import Controller
 from dfsm.core.files import json_value
 from dfsm.core.settings import require, settings_class
-from dfsm.core.units import POWERS, plain
+from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
 from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
+from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.signals import with_computed
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loops
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 
@@ -186,7 +186,7 @@ def sweep(
     named = [n for n in (settings.power, settings.speed) if n is not None]
     if lost := [n for n in named if n not in units]:
         raise DfsmError(f"settings: the model has {missing(lost, units)}")
-    runs = [with_computed(run, s.hub_height, s.features) for run in runs]
+    runs = [completed(run, s) for run in runs]
     with hushed():
         rolled = closed_loops(
             model,
@@ -250,11 +250,10 @@ def _over_all(
         figures = {n: Figures.over([run[n] for run in whole], weights) for n in whole[0]}
     energy = overshoot = None
     if settings.power in figures:
-        kilowatts = POWERS.get(plain(units[settings.power]))
+        kilowatts = factor(units[settings.power], "kW")
         if kilowatts is None:
             raise DfsmError(
-                f"power: '{settings.power}' is in '{units[settings.power]}', expected one of "
-                f"{', '.join(POWERS)}"
+                f"power: '{settings.power}' is in '{units[settings.power]}', expected one of power"
             )
         mean = figures[settings.power].mean * kilowatts
         energy = mean * sum(weights) * HOURS_PER_YEAR / 1e3

@@ -303,43 +303,15 @@ class DFSM(eqx.Module):
 
     def summary(self) -> str:
         """Describe the model: signals, which rows are corrected and why, stability, warnings."""
-        s, record = self.signals, self.provenance.record
-        lines = [
-            f"{group}: {', '.join(c.label for c in getattr(s, group))}"
-            for group in ("states", "controls", "disturbances", "parameters", "outputs")
-            if getattr(s, group)
-        ]
-        if s.azimuth is not None and s.azimuth.rings:
-            rings = ", ".join(f"{r:g}" for r in s.azimuth.rings)
-            lines.append(
-                f"wind field, for outputs: {len(s.field)} harmonics over rings of {rings} m"
-            )
-        if self.terms is not None:
-            lines.append(f"terms: {', '.join(c.label for c in self.terms.channels)}")
-        kind = f"LPV in {self.schedule}, {len(self.f.grid)} points" if self.schedule else "LTI"
-        lines.append(f"linear fit: {kind}, condition number {record.get('condition', np.nan):.3g}")
-        for row in record.get("rows", []):
-            lines.append(f"  {row['name']} ({row['unit']}): {row['decision']}")
-        for point, values in self.eigenvalues():
-            where = f" at {self.schedule} = {point:.4g}" if self.schedule else ""
-            listed = ", ".join(_complex(v) for v in values if v.imag >= 0)
-            unstable = "  UNSTABLE" if values.real.max() > 0 else ""
-            lines.append(f"  eigenvalues (1/s){where}: {listed}{unstable}")
-        lines += [f"check: {text}" for text in record.get("checks", [])]
-        if "refinement" in record:
-            lines.append(record["refinement"]["message"])
-        lines += [f"warning: {text}" for text in record.get("warnings", [])]
-        return "\n".join(lines)
+        from dfsm.models.summary import lines_of
+
+        return "\n".join(lines_of(self))
 
     @property
     def schedule(self) -> str | None:
         """Name of the scheduling input, None for an LTI model."""
         column = self.f.schedule
         return None if column is None else self.signals.inputs[column].name
-
-
-def _complex(value: complex) -> str:
-    return f"{value.real:.3g}" + (f" ± {value.imag:.3g}i" if value.imag else "")
 
 
 def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:

@@ -20,12 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
 
 # Before the record begins, the inputs are taken to have been what they were on average over this.
 _REST = 20.0  # s
@@ -91,7 +93,9 @@ def _places(model: DFSM) -> tuple[slice, int, IntArray, IntArray]:
 
 
 @jax.jit
-def evolve(dynamics: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.Array:
+def evolve(
+    dynamics: Poles, h: jax.Array, v: jax.Array, rest: jax.Array, ends: jax.Array | None = None
+) -> jax.Array:
     """Follow the latent pairs along inputs that vary linearly within each step.
 
     Parameters
@@ -104,6 +108,9 @@ def evolve(dynamics: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.
         Controls and disturbances at the ends of the steps, ``(step + 1, control + disturbance)``.
     rest
         The pairs start at rest under these, ``(control + disturbance,)``.
+    ends
+        Inputs at the end of each step as it comes, ``(step, control + disturbance)``, where some
+        jump between steps: `v` then holds those at its beginning. None where none does.
 
     Returns
     -------
@@ -117,7 +124,8 @@ def evolve(dynamics: Poles, h: jax.Array, v: jax.Array, rest: jax.Array) -> jax.
     end = h[:, None] * (1 / 2 + x / 6 + x**2 / 24)
     begin = h[:, None] * (1 + x / 2 + x**2 / 6 + x**3 / 24) - end
     force = v @ dynamics.drive.T + dynamics.offset
-    added = begin * force[:-1] + end * force[1:]
+    last = force[1:] if ends is None else ends @ dynamics.drive.T + dynamics.offset
+    added = begin * force[:-1] + end * last
     start = -(dynamics.drive @ rest + dynamics.offset) / rate
 
     def step(z: jax.Array, terms: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -174,15 +182,29 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     h = np.zeros(padded)
     h[: len(run) - 1] = np.diff(run.time)
     v = np.concatenate([inputs.values, np.repeat(inputs.values[-1:], padded + 1 - len(run), 0)])
-    path = as_states(evolve(poles(model), h, v, rest(run.time, inputs.values)))
+    ends, held = None, _held(model)
+    if held.any():
+        ends = jnp.asarray(np.where(held, v[:-1], v[1:]))
+    path = as_states(evolve(poles(model), h, v, rest(run.time, inputs.values), ends))
     return np.asarray(path)[: len(run)]
+
+
+def _held(model: DFSM) -> NDArray[np.bool_]:
+    """Which controls and disturbances are held between samples."""
+    s = model.signals
+    return np.array([kind == "hold" for kind in s.between_samples()[: len(s.driving)]], dtype=bool)
 
 
 def latents_at(model: DFSM, run: Trajectory, time: Array) -> Array:
     """Latent states at times in s within a run, ``(time, latent)``; see `latent_path`."""
     time = np.clip(time, run.time[0], run.time[-1])
     both = np.union1d(run.time, time)
-    path = latent_path(model, run.select(model.signals.driving).resample(both))
+    inputs = run.select(model.signals.driving)
+    fine, held = inputs.resample(both), _held(model)
+    if held.any():
+        last = inputs.values[np.searchsorted(run.time, both, side="right") - 1]
+        fine = replace(fine, values=np.where(held, last, fine.values))
+    path = latent_path(model, fine)
     return path[np.searchsorted(both, time)]
 
 
@@ -202,7 +224,10 @@ def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
 
 def rest(time: Array, inputs: Array) -> Array:
     """Inputs before a record begins, ``(input,)`` from ``(time, input)``."""
-    return inputs[time <= time[0] + _REST].mean(axis=0)
+    before = time <= time[0] + _REST
+    if before.sum() < 2:
+        return inputs[0]
+    return mean_over(inputs[before], weights_over_time([time[before]]))
 
 
 # -- adding them to a model ---------------------------------------------------------------------

@@ -13,14 +13,16 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from dfsm.core.bundle import MANIFEST, Bundle
-from dfsm.core.files import check_folder
+from dfsm.core.exchange import recover
+from dfsm.core.files import check_folder, visible
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
 from dfsm.models.dfsm import DFSM
+from dfsm.models.folder_check import RecordCheck, check_model
 from dfsm.models.linear import LinearModel
 from dfsm.models.passing import Passing
 from dfsm.models.region import Region
@@ -105,16 +107,20 @@ def load_all(
     manifest = _read_manifest(path)
     tensors = _BUNDLE.read_tensors(path, manifest)
     try:
-        signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
-        provenance = Provenance(manifest["provenance"])
-        return {
+        signals, provenance = _about(manifest)
+        models = {
             name: _put_together(structure, name, tensors, (signals, provenance), functions or {})
             for name, structure in manifest["models"].items()
         }
-    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        if MULTI_FIDELITY not in models:
+            raise KeyError(MULTI_FIDELITY)
+        for model in models.values():
+            check_model(model)
+    except _GARBLED as error:
         raise _BUNDLE.damaged(
             path, f"its {MANIFEST} lacks or garbles {error}".split("\n")[0]
         ) from None
+    return models
 
 
 # -- taking apart and putting together ----------------------------------------------------------
@@ -165,6 +171,21 @@ _LINEAR = ("grid", "coefficients", "offsets")
 _PASSING = ("coefficients", "speed", "schedule")
 
 
+# What Python, JAX and pydantic say of parts that do not fit together.
+_GARBLED = (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError)
+
+
+def _about(manifest: Mapping[str, Any]) -> tuple[SignalTable, Provenance]:
+    """Signals and history, checked."""
+    try:
+        signals = TypeAdapter(SignalTable).validate_python(manifest["signals"])
+    except DfsmError as error:
+        # Of a settings class, which speaks of a configuration.
+        raise ValueError(f"signals ({error})") from None
+    RecordCheck.model_validate(manifest["provenance"])
+    return signals, Provenance(manifest["provenance"])
+
+
 def _put_together(
     structure: Mapping[str, Any],
     prefix: str,
@@ -212,7 +233,10 @@ def _put_together(
     f = linear("f")
     if f is None:
         raise KeyError("f")
-    if not structure.get("latents", 0):
+    latents = structure.get("latents", 0)
+    if latents not in (0, len(signals.latents)):
+        raise ValueError(f"latents, which are {len(signals.latents)} in its signals")
+    if not latents:
         # The nonlinear-only model beside a refined one has none.
         signals = replace(signals, states=signals.observed, latents=())
     return DFSM(
@@ -235,10 +259,11 @@ def _put_together(
 
 def _is_model(path: Path) -> bool:
     # Both files: other programs write a manifest.json too.
-    return {p.name for p in path.iterdir()} == {MANIFEST, TENSORS}
+    return visible(path) == {MANIFEST, TENSORS}
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
+    recover(path)
     if not path.is_dir():
         kind = "a file" if path.exists() else "missing"
         raise DfsmError(f"{path} is {kind}; a model folder as 'dfsm fit' writes it was expected")

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.settings import require, settings_class
-from dfsm.core.units import SPEEDS
+from dfsm.core.units import factor
+from dfsm.data.between import Between, Chosen, resolved
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature, with_features
 from dfsm.data.trajectory import Channel, Trajectory
@@ -20,6 +21,9 @@ from dfsm.data.wind import CORRECTED_WIND, undisturbed_rotor_wind
 from dfsm.data.wind_field import ring_channel
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.inputs import GROUPS, InputOrder
+
+# More than any rotor has; harmonics are tried up to their number.
+_BLADES = 100
 
 
 @settings_class
@@ -62,6 +66,7 @@ class Azimuth:
 
     def __post_init__(self) -> None:
         require(self.blades >= 1, "azimuth.blades", self.blades, "at least 1")
+        require(self.blades <= _BLADES, "azimuth.blades", self.blades, f"at most {_BLADES}")
         require(self.direction in (-1, 1), "azimuth.direction", self.direction, "-1 or 1")
         shown = [f"{r:g}" for r in self.rings]
         good = all(r > 0 for r in self.rings) and len({ring_channel("U", r) for r in self.rings})
@@ -117,6 +122,9 @@ class SignalTable:
         The last of the states: those that no channel holds, see `latents.py`.
     field
         Harmonics of the wind field, which drive ĝ alone; see `Azimuth`.
+    between
+        What controls and disturbances, in this order, do between samples, see `data.between`;
+        empty for lines.
     specs
         Which states are measured and which are their rates, see `StateSpec`.
     derivatives
@@ -142,6 +150,7 @@ class SignalTable:
     features: tuple[Feature, ...] = ()
     latents: tuple[Channel, ...] = ()
     field: tuple[Channel, ...] = ()
+    between: tuple[Between, ...] = ()
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
@@ -162,6 +171,12 @@ class SignalTable:
     def driving(self) -> tuple[str, ...]:
         """Names of controls and disturbances, the columns of B."""
         return self.order.driving
+
+    def between_samples(self, chosen: Chosen = None) -> tuple[Between, ...]:
+        """What each exogenous input does between samples; `chosen` goes before the model's own."""
+        kinds = resolved(chosen, self.driving, self.between)
+        # Parameters are constant: a line, whatever the others do.
+        return (*kinds, *("linear" for _ in self.parameters))
 
     @property
     def state_columns(self) -> slice:
@@ -287,12 +302,12 @@ def radians_per_second(speed: Channel) -> float:
     DfsmError
         The unit is not one of a rotational speed.
     """
-    if speed.unit not in SPEEDS:
+    radians = factor(speed.unit, "rad/s")
+    if radians is None:
         raise DfsmError(
-            f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of "
-            f"{', '.join(SPEEDS)}"
+            f"azimuth.speed '{speed.name}' is in '{speed.unit}', expected one of rpm, rad/s, deg/s"
         )
-    return SPEEDS[speed.unit]
+    return radians
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +24,107 @@ _MIXTURES = 9
 _DEFECTIVE = float(np.sqrt(np.finfo(float).eps))
 # A corrective function is examined at so many places from one operating point to the next.
 _PLACES = 4
+# Growth to less than e to this power over the longest run is that of an integrator, and one within
+# so many standard errors of zero is not told from it.
+_INTEGRATES, _TOLD = 0.05, 2.0
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What the fastest mode of a model does at one schedule value.
+
+    Attributes
+    ----------
+    schedule
+        The value.
+    rate
+        Largest real part of the eigenvalues in 1/s.
+    seconds
+        Longest training run; 0 where nobody knows, and then the sign alone judges.
+    error
+        Standard error of `rate`, or 0.
+    """
+
+    schedule: float
+    rate: float
+    seconds: float = 0.0
+    error: float = 0.0
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the mode neither grows nor decays over the longest run, or is exactly zero."""
+        return abs(self.rate) * self.seconds <= _INTEGRATES and (self.rate == 0 or self.seconds > 0)
+
+    @property
+    def unclear(self) -> bool:
+        """Whether it grows, but by no more than is known of it."""
+        return not self.integrates and 0 < self.rate <= _TOLD * self.error
+
+    @property
+    def unstable(self) -> bool:
+        """Whether it grows, over the longest run and beyond doubt."""
+        return self.rate > 0 and not self.integrates and not self.unclear
+
+    @property
+    def word(self) -> str:
+        """How a table marks it; empty for a stable one."""
+        if self.unstable:
+            return "UNSTABLE"
+        if self.integrates:
+            return "integrator"
+        return "growth within its standard error" if self.unclear else ""
+
+
+def growths(model: DFSM, seconds: float, errors: Array | None = None) -> list[Growth]:
+    """Judge the whole model, corrective function included, at its operating points.
+
+    Parameters
+    ----------
+    model
+        Any; latent states decay whatever the inputs are.
+    seconds
+        Longest training run.
+    errors
+        Standard errors of the linear fit's coefficients of the states, ``(state, state)``; they
+        say nothing of a model with a corrective function.
+
+    Returns
+    -------
+    list of Growth
+        In the order of the schedule; one of an LTI model without a corrective function.
+    """
+    if model.e is not None:
+        grid, points = operating_points(model)
+        rates = np.linalg.eigvals(state_matrices(model, points)).real.max(axis=1)
+        return [Growth(float(s), float(r), seconds) for s, r in zip(grid, rates, strict=True)]
+    found = []
+    for point, A in zip(np.asarray(model.f.grid), model.linear_state_matrices(), strict=True):
+        eigenvalues, left, right = eigen(A)
+        k = int(np.argmax(eigenvalues.real))
+        error = 0.0
+        if errors is not None:
+            # dλ = wᴴ dA v, with errors of A's entries that are taken as independent.
+            slopes = np.real(np.outer(left[k].conj(), right[k]))
+            known = np.nan_to_num(errors, nan=0.0, posinf=np.inf)
+            error = float(np.sqrt(np.sum((slopes * np.where(slopes, known, 0.0)) ** 2)))
+        found.append(Growth(float(point), float(eigenvalues[k].real), seconds, error))
+    return found
+
+
+def told_growths(model: DFSM) -> list[Growth]:
+    """`growths` of a model that was fitted, as its record has them, else judged here."""
+    record = model.provenance.record
+    if "growth" in record:
+        return [Growth(**entry) for entry in record["growth"]]
+    seconds = max((d.get("seconds", 0.0) for d in record.get("data", [])), default=0.0)
+    return growths(model, seconds)
+
+
+def places(growths: Sequence[Growth], schedule: str | None) -> str:
+    """Where they are, for a sentence."""
+    if not schedule:
+        return "its only point"
+    return f"{schedule} = {', '.join(f'{g.schedule:.4g}' for g in growths)}"
 
 
 def fastest_growth(A: Array) -> float:

@@ -6,6 +6,7 @@ import fatpack
 import numpy as np
 
 from dfsm.core.shapes import Series
+from dfsm.errors import DfsmError
 
 WOHLER_EXPONENTS = (3.0, 4.0, 5.0, 10.0)
 
@@ -31,7 +32,25 @@ def damage_equivalent_load(
     float
         ``(Σ n_i S_i^m / (frequency duration))^(1/m)`` in the unit of the load; cycles are those
         of the history repeated end to end, so that no half cycles remain.
+
+    Raises
+    ------
+    DfsmError
+        A sample is NaN or infinite, there are none, or no time has passed.
     """
+    values = np.asarray(values, dtype=np.float64)
+    if not len(values):
+        raise DfsmError("the load history has no samples, so no cycles: give a longer part")
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise DfsmError(
+            f"the load history has {len(bad)} NaN or infinite samples, the first is number "
+            f"{bad[0] + 1}, so its cycles cannot be counted: leave that part of the run out"
+        )
+    if not duration > 0:
+        raise DfsmError(
+            f"the load history lasts {duration:g} s, expected more than 0 s: give its length"
+        )
     if np.ptp(values) == 0:
         return 0.0
     # From its maximum to its maximum nothing remains open after counting (ASTM E1049, 5.4.5);

@@ -35,11 +35,18 @@ class NormalEquations:
         self.shift = np.asarray(shift, dtype=np.float64)
         self.n_inputs = n_inputs
         self.count = 0
+        self.weight = 0.0
         self.independent = 0.0
         self.sums = np.zeros(len(self.shift))
         self.products = np.zeros((len(self.shift), len(self.shift)))
 
-    def add(self, inputs: Array, targets: Array, correlation: float = 1.0) -> None:
+    def add(
+        self,
+        inputs: Array,
+        targets: Array,
+        correlation: float = 1.0,
+        weights: Array | None = None,
+    ) -> None:
         """Add samples.
 
         Parameters
@@ -48,6 +55,8 @@ class NormalEquations:
             Shapes ``(sample, input)`` and ``(sample, target)``.
         correlation
             How many samples count as one, see `correlation_length`.
+        weights
+            What each sample counts, ``(sample,)``, 1 on average over all; None for 1.
         """
         # Channels as rows: contiguous, so that the product runs at the speed of the memory.
         block = np.empty((len(self.shift), BLOCK))
@@ -57,25 +66,32 @@ class NormalEquations:
             z = block[:, : stop - start]
             np.subtract(inputs[start:stop].T, self.shift[:m, None], out=z[:m])
             np.subtract(targets[start:stop].T, self.shift[m:, None], out=z[m:])
-            self.products += z @ z.T
-            self.sums += z.sum(axis=1)
+            if weights is None:
+                self.products += z @ z.T
+                self.sums += z.sum(axis=1)
+            else:
+                weighted = z * weights[start:stop]
+                self.products += weighted @ z.T
+                self.sums += weighted.sum(axis=1)
+        weight = len(inputs) if weights is None else float(weights.sum())
         self.count += len(inputs)
-        self.independent += len(inputs) / correlation
+        self.weight += weight
+        self.independent += weight / correlation
 
     def moments(self, centred: bool) -> tuple[Array, Array]:
         """Return the mean, and the mean products about it (about zero if not `centred`)."""
-        offset = self.sums / self.count
+        offset = self.sums / self.weight
         if centred:
-            return self.shift + offset, self.products / self.count - np.outer(offset, offset)
+            return self.shift + offset, self.products / self.weight - np.outer(offset, offset)
         if self.shift.any():
             raise ValueError("uncentred moments need sums about zero")
-        return np.zeros_like(self.shift), self.products / self.count
+        return np.zeros_like(self.shift), self.products / self.weight
 
     @property
     def std(self) -> Array:
         """Standard deviation of every input and target."""
-        offset = self.sums / self.count
-        return np.sqrt(np.maximum(np.diag(self.products) / self.count - offset**2, 0.0))
+        offset = self.sums / self.weight
+        return np.sqrt(np.maximum(np.diag(self.products) / self.weight - offset**2, 0.0))
 
     @property
     def still(self) -> NDArray[np.bool_]:
@@ -274,6 +290,7 @@ def merge(parts: Sequence[NormalEquations]) -> NormalEquations:
     total = NormalEquations(parts[0].shift, parts[0].n_inputs)
     for part in parts:
         total.count += part.count
+        total.weight += part.weight
         total.independent += part.independent
         total.sums += part.sums
         total.products += part.products
@@ -316,8 +333,8 @@ def shared_coefficients(
         # What the free inputs explain is taken out of both sides (Frisch, Waugh and Lovell).
         out = np.linalg.lstsq(inner, products[rest][:, some] / scale[:, None], rcond=1e-9)[0]
         out = out / scale[:, None]
-        left += part.count * (products[np.ix_(some, some)] - out.T @ products[rest][:, some])
-        right += part.count * (products[some, m:] - out.T @ products[rest, m:])
+        left += part.weight * (products[np.ix_(some, some)] - out.T @ products[rest][:, some])
+        right += part.weight * (products[some, m:] - out.T @ products[rest, m:])
     shared = np.linalg.lstsq(left, right, rcond=None)[0].T
     for target in {t for t, _ in known or {}}:
         held = {k: value for (t, k), value in (known or {}).items() if t == target}

@@ -1,8 +1,11 @@
-"""Time meshes."""
+"""Time meshes: equidistant or not, what time a sample stands for, samples at one instant."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.shapes import Series
 
@@ -11,6 +14,10 @@ _SHARE = 1e-3
 # Rounding that is coarser than this share of a step hides whether a mesh is equidistant.
 _COARSE = 0.1
 _MOST_DECIMALS = 8
+# Samples that make a rate; three at equal distances happen by chance.
+_FEWEST = 4
+# Share of the usual step below which two samples are one instant.
+_INSTANT = 1e-6
 
 
 def time_step(time: Series) -> float | None:
@@ -42,6 +49,60 @@ def time_step(time: Series) -> float | None:
     return step if error <= _rounding(time, step) + slack else None
 
 
+def without_rounding(time: Series) -> Series:
+    """Times of an equidistant mesh without the rounding of their file.
+
+    At 0.00625 s, four decimals move times by up to 0.8 % of a step; a spline through the samples
+    would take that for motion.
+
+    Parameters
+    ----------
+    time
+        Times in s, shape ``(time,)``, at least two.
+
+    Returns
+    -------
+    ndarray
+        Times at the shortest step that rounds to these, where they are equidistant and rounded to
+        decimals or to single precision; otherwise the times as they are.
+    """
+    if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+        return time
+    step = time_step(time)
+    unit = 0.0 if step is None else _rounding(time, step)
+    if step is None or unit == 0.0:
+        return time
+    index, slack = np.arange(len(time)), 4 * np.spacing(np.abs(time).max())
+    slope, start = np.polyfit(index.astype(np.float64), time, 1)
+    # The shortest step that rounds to these times is the one that was meant.
+    lines = [time[0] + float(f"{slope:.{digits}g}") * index for digits in range(1, 10)]
+    near = (line for line in lines if np.abs(line - time).max() <= unit / 2 + slack)
+    line = next(near, start + slope * index)
+    return line if np.abs(line - time).max() > slack else time
+
+
+def own_interval(time: Series, present: NDArray[np.bool_]) -> float | None:
+    """Interval of a signal that has a sample at some times of a mesh only, at regular ones.
+
+    Parameters
+    ----------
+    time
+        Strictly increasing times in s, shape ``(time,)``.
+    present
+        Where the signal has a sample, shape ``(time,)``.
+
+    Returns
+    -------
+    float or None
+        In s; None where no sample is missing between the first and the last, where they are not
+        equidistant, or fewer than four.
+    """
+    rows = np.flatnonzero(present)
+    if len(rows) < _FEWEST or len(rows) == rows[-1] - rows[0] + 1:
+        return None
+    return time_step(time[rows])
+
+
 def _rounding(time: Series, step: float) -> float:
     """Unit in s to which the times of an equidistant mesh seem to be rounded; 0 for none."""
     largest, most = np.abs(time).max(), _COARSE * step
@@ -55,3 +116,83 @@ def _rounding(time: Series, step: float) -> float:
             # Whole multiples of the unit would not have been rounded.
             return 0.0 if round((time[-1] - time[0]) / unit) % (len(time) - 1) == 0 else unit
     return 0.0
+
+
+def weights_over_time(times: Sequence[Series]) -> Series | None:
+    """Weights that turn sums over the samples of some runs into integrals over time.
+
+    On a mesh that is not equidistant a sample stands for half the time to each of its neighbours
+    (the trapezoidal rule), on an equidistant one for a step.
+
+    Parameters
+    ----------
+    times
+        Strictly increasing times in s of every run, each of shape ``(time,)``, at least two.
+
+    Returns
+    -------
+    ndarray or None
+        One weight per sample of all runs, 1 on average, shape ``(sample,)``. None where all runs
+        have one and the same step, so that every sample counts alike.
+    """
+    steps = [time_step(time) for time in times]
+    known = [step for step in steps if step is not None]
+    if len(known) == len(steps) and max(known) <= (1 + _SHARE) * min(known):
+        return None
+    parts = []
+    for time, step in zip(times, steps, strict=True):
+        between = np.diff(time) / 2
+        by_rule = np.concatenate([between, [0.0]]) + np.concatenate([[0.0], between])
+        parts.append(by_rule if step is None else np.full(len(time), step))
+    weights = np.concatenate(parts)
+    return weights / weights.mean()
+
+
+def mean_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
+    """Mean over samples ``(sample, ...)`` with weights ``(sample,)``; None takes all alike."""
+    return values.mean(axis=0) if weights is None else np.average(values, axis=0, weights=weights)
+
+
+def std_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
+    """Standard deviation over samples, with weights as in `mean_over`."""
+    if weights is None:
+        return values.std(axis=0)
+    return np.sqrt(mean_over((values - mean_over(values, weights)) ** 2, weights))
+
+
+def quantiles_over(
+    values: Series, at: float | Sequence[float] | np.ndarray, weights: Series | None
+) -> np.ndarray:
+    """Quantiles of samples ``(sample,)`` at shares of their number, or of their weight."""
+    if weights is None:
+        return np.quantile(values, np.asarray(at))
+    order = np.argsort(values, kind="stable")
+    weight = weights[order]
+    share = (np.cumsum(weight) - weight / 2) / weight.sum()
+    return np.interp(np.asarray(at), share, values[order])
+
+
+def same_instant(time: Series) -> np.ndarray:
+    """Tell which intervals are none: both samples stand for one instant, before and after a jump.
+
+    An event-driven solver writes an event twice, at times that differ by less than a millionth of
+    the usual step, or by no more than times are rounded.
+
+    Parameters
+    ----------
+    time
+        Strictly increasing times in s, shape ``(time,)``.
+
+    Returns
+    -------
+    ndarray
+        Booleans, one per interval, shape ``(time - 1,)``.
+    """
+    steps = np.diff(time)
+    # The mean: where every sample is written twice, the median is of the wrong kind.
+    usual, largest = (time[-1] - time[0]) / len(steps), np.abs(time).max()
+    limit = max(_INSTANT * usual, 4 * float(np.spacing(largest)))
+    single = 1.5 * float(np.spacing(np.float32(largest)))
+    if single < _SHARE * usual and np.array_equal(time.astype(np.float32), time):
+        limit = max(limit, single)
+    return steps <= limit

@@ -349,9 +349,12 @@ def _result(
         }
         model = replace(refined, provenance=Provenance(record))
     else:
+        tried = [e["validation"] for e in history if "validation" in e]
+        best = f", at best {np.sqrt(min(tried)):.3g} after a step" if tried else ""
         message = (
-            "refinement did not lower the error of rollouts over the runs held out, so the model "
-            "it started from is returned: use more runs, or shorter refine.windows"
+            "refinement did not lower the error of rollouts over the runs held out "
+            f"({np.sqrt(before):.3g} standard deviations{best}; {ended[-1]}), so the model it "
+            "started from is returned: use more runs, or shorter refine.windows"
         )
         warnings.warn(message, DfsmWarning, stacklevel=3)
     return RefineResult(model, improved, before, after, tuple(history), tuple(ended), message)

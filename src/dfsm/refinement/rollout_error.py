@@ -23,18 +23,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
-from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
+from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, as_states, evolve, poles, rest
-from dfsm.models.signals import with_computed
+from dfsm.models.recorded import recorded_states
 from dfsm.numerics.filters import moving_average
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.slopes import FAR, sensitivities, spread_steps
-from dfsm.simulation.integrate import rk4
+from dfsm.simulation.integrate import rk4, stages
 
 # JᵀJ is summed over the middle one of every four steps, and over more where windows have few:
 # products of the matrices of slopes would be most of the time. Jᵀr is exact.
@@ -58,6 +59,9 @@ class Record:
         ``(2 (before + step) + 1, exogenous)``.
     rest
         Controls and disturbances before the record begins.
+    held
+        Which exogenous inputs are the same throughout each step, as in its middle,
+        ``(exogenous,)``; None where none is.
     """
 
     step: float
@@ -66,12 +70,22 @@ class Record:
     slopes: Array
     inputs: Array
     rest: Array
+    held: NDArray[np.bool_] | None = None
+
+    def driving(self) -> tuple[Array, Array | None]:
+        """Controls and disturbances at the ends of steps, and where some jump, as each ends."""
+        n, v = len(self.rest), self.inputs
+        if self.held is None:
+            return v[::2, :n], None
+        begin, _, end = (np.asarray(part)[:, :n] for part in stages(jnp.asarray(v), self.held))
+        return np.concatenate([begin, v[-1:, :n]]), end
 
     def follow(self, filters: Poles) -> Array:
         """Latent pairs from the start of the record on, complex, ``(before + step + 1, pair)``."""
         h = jnp.full(len(self.inputs) // 2, self.step)
-        v = jnp.asarray(self.inputs[::2, : len(self.rest)])
-        return np.asarray(evolve(filters, h, v, jnp.asarray(self.rest)))
+        v, ends = self.driving()
+        ends = None if ends is None else jnp.asarray(ends)
+        return np.asarray(evolve(filters, h, jnp.asarray(v), jnp.asarray(self.rest), ends))
 
     def latent_states(self, model: DFSM) -> Array:
         """A model's latent states from the first state on, ``(step + 1, latent)``."""
@@ -104,8 +118,9 @@ def record_of(
         Time window in s of the states.
     """
     s = model.signals
-    run = with_computed(run, s.hub_height, s.features)
-    extracted = differentiate(run, s.specs, s.derivatives)
+    run = completed(run, s)
+    kinds = s.between_samples()
+    recorded = recorded_states(model, run, start)
     window = run.window(start, stop)
     count = int(window.duration / step * (1 + 1e-9))
     before = int((window.time[0] - run.time[0]) / step * (1 + 1e-9))
@@ -116,17 +131,34 @@ def record_of(
         np.interp(mesh, run.time, moving_average(run.time, run[n], step) if dense else run[n])
         for n in s.exogenous
     ]
-    states = extracted.trajectory.select(extracted.names)
+    held = np.array([kind == "hold" for kind in kinds], dtype=bool)
+    for k in np.flatnonzero(held):
+        inputs[k] = _held_along(mesh, run.time, run[s.exogenous[k]])
     at = mesh[2 * before :: 2]
-    slopes = [np.interp(at, run.time, d) for d in extracted.derivatives.T]
+    slopes = [
+        np.interp(at, recorded.found.trajectory.time, d) for d in recorded.found.derivatives.T
+    ]
     return Record(
         step,
         before,
-        states.resample(at).values,
+        recorded.at(at),
         np.stack(slopes, axis=1),
         np.stack(inputs, axis=1),
         rest(run.time, run.select(s.driving).values),
+        held if held.any() else None,
     )
+
+
+def _held_along(mesh: Array, time: Array, values: Array) -> Array:
+    """A held input at the ends of steps, and its mean over each of them in their middles.
+
+    Jumps need not be where steps end: the mean is what acts on the states over a step.
+    """
+    at = values[np.clip(np.searchsorted(time, mesh, side="right") - 1, 0, None)]
+    areas = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(time))])
+    ends = np.interp(mesh[::2], time, areas)
+    at[1::2] = np.diff(ends) / np.diff(mesh[::2])
+    return at
 
 
 class _Windows(NamedTuple):
@@ -144,6 +176,8 @@ class _Windows(NamedTuple):
         Steps from the start of the record to that of each window.
     record, rest
         Controls and disturbances of the whole record at the ends of steps, and before it.
+    held, record_ends
+        As `Record.held`, and what `Record.driving` says of the record.
     """
 
     step: float
@@ -152,6 +186,8 @@ class _Windows(NamedTuple):
     first: IntArray
     record: Array
     rest: Array
+    held: NDArray[np.bool_] | None
+    record_ends: Array | None
 
 
 def _windows(record: Record, length: float | None) -> _Windows:
@@ -159,13 +195,16 @@ def _windows(record: Record, length: float | None) -> _Windows:
     each = steps if length is None else min(steps, round(length / record.step))
     first = np.arange(0, steps - each + 1, each)
     begin = 2 * (first + record.before)
+    driving, ends = record.driving()
     return _Windows(
         record.step,
         np.stack([record.states[i : i + each + 1] for i in first]),
         np.stack([record.inputs[i : i + 2 * each + 1] for i in begin]),
         first + record.before,
-        record.inputs[::2, : len(record.rest)],
+        driving,
         record.rest,
+        record.held,
+        ends,
     )
 
 
@@ -284,7 +323,7 @@ def _errors(
     """Errors over the windows of one run, scaled, ``(window, time, state)``."""
     model = parameters.at(w).prepared()
     h = jnp.full(windows.states.shape[1] - 1, windows.step)
-    follow = jax.vmap(lambda x0, v: rk4(model, x0, h, v, FAR))
+    follow = jax.vmap(lambda x0, v: rk4(model, x0, h, stages(v, windows.held), FAR))
     xs = follow(_starts(model, windows), jnp.asarray(windows.inputs))
     return (xs[:, 1:, : len(scale)] - windows.states[:, 1:]) * scale
 
@@ -324,7 +363,8 @@ def _slopes(
     steps = errors.shape[1]
     every = max(1, min(_EVERY, steps // _FEWEST))
     follow = partial(sensitivities, parameters, w, windows.step, every=every)
-    each = (starts, slopes, jnp.asarray(windows.inputs), jnp.asarray(errors * scale))
+    along = jax.vmap(lambda v: stages(v, windows.held))(jnp.asarray(windows.inputs))
+    each = (starts, slopes, along, jnp.asarray(errors * scale))
     S, totals = jax.lax.map(lambda one: follow(*one), each)
     _, counts = spread_steps(steps, every)
     J = S * (np.sqrt(counts)[:, None] * scale)[..., None]
@@ -354,5 +394,6 @@ def _starts(model: DFSM, windows: _Windows) -> jax.Array:
         return measured
     record = jnp.asarray(windows.record)
     h = jnp.full(len(record) - 1, windows.step)
-    path = as_states(evolve(poles(model), h, record, jnp.asarray(windows.rest)))
+    ends = None if windows.record_ends is None else jnp.asarray(windows.record_ends)
+    path = as_states(evolve(poles(model), h, record, jnp.asarray(windows.rest), ends))
     return jnp.concatenate([measured, path[windows.first]], axis=1)

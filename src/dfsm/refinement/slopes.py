@@ -19,7 +19,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import poles
 from dfsm.numerics.runge_kutta import rk4_step
 from dfsm.refinement.parameters import Parametrization
-from dfsm.simulation.integrate import clip_range, rate
+from dfsm.simulation.integrate import Stages, clip_range, rate
 
 # A rollout that leaves the training range this many half-ranges from its middle is cut off there:
 # the error stays finite and still has a slope.
@@ -62,7 +62,7 @@ def sensitivities(
     step: float,
     x0: jax.Array,
     pairs0: jax.Array,
-    v: jax.Array,
+    drive: Stages,
     errors: jax.Array,
     every: int,
 ) -> tuple[jax.Array, jax.Array]:
@@ -82,8 +82,8 @@ def sensitivities(
         States at the start, shape ``(state,)``.
     pairs0
         Slopes of the latent pairs there, shape ``(pair, 2, own)``.
-    v
-        Exogenous inputs at ends and middles, ``(2 step + 1, exogenous)``.
+    drive
+        Exogenous inputs along the steps, see `integrate.stages`.
     errors
         Factors e of the slopes in a sum, ``(step, observed state)``.
     every
@@ -96,7 +96,7 @@ def sensitivities(
         ``(parameter,)``.
     """
     model = parameters.at(w)
-    path = _path(parameters, model, step, x0, pairs0, v)
+    path = _path(parameters, model, step, x0, pairs0, drive)
     observed, steps = len(model.signals.observed), len(path.states)
 
     def along(
@@ -190,7 +190,7 @@ def _path(
     step: float,
     x0: jax.Array,
     pairs0: jax.Array,
-    v: jax.Array,
+    drive: Stages,
 ) -> _Path:
     """March states and latent slopes; arguments as for `sensitivities`, `plain` is the model."""
     model, dynamics = plain.prepared(), poles(plain)
@@ -217,7 +217,7 @@ def _path(
         pairs = jnp.stack([pair for _, pair in stages])
         return (held, P), _Path(held, free, jnp.stack(seen), pairs)
 
-    return jax.lax.scan(advance, (x0, pairs0), (v[:-2:2], v[1::2], v[2::2]))[1]
+    return jax.lax.scan(advance, (x0, pairs0), drive)[1]
 
 
 def _state_matrix(model: DFSM, inputs: jax.Array) -> jax.Array:

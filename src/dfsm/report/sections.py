@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from dfsm.data.trajectory import Channel
+from dfsm.fitting.verdicts import grade
+from dfsm.models.stability import Growth
 from dfsm.report.elements import MISSING, Cell, Markup, element, join, number, plural, table
 from dfsm.simulation.simulate import Status
-from dfsm.validation.results import Validation
+from dfsm.validation.results import MULTI_FIDELITY, Validation
 
 # More sentences than this about rollouts that ended early are folded away.
 _MOST_NOTES = 5
@@ -51,7 +53,27 @@ def headline(name: str, validation: Validation) -> Markup:
     if rows and not any(r.get("corrected") for r in rows):
         text += "No row was corrected, so the multi-fidelity model is its linear fit. "
     text += _speed(v)
-    return element("article", element("h3", name), element("p", text), cautions(v), cls="headline")
+    parts = (element("h3", name), element("p", text), verdicts(v), cautions(v))
+    return element("article", *parts, cls="headline")
+
+
+def verdicts(validation: Validation) -> Markup:
+    """What each measured signal is good for by these runs, and what its fit advises if not."""
+    v = validation
+    if MULTI_FIDELITY not in v.models:
+        return Markup("")
+    advised = {entry["name"]: entry["text"] for entry in v.record.get("verdicts", ())}
+    items = []
+    for channel in main_channels(v):
+        error = v.mean_nrmse(MULTI_FIDELITY, channel.name)
+        verdict = grade(error)
+        text = f"{channel.name}: {verdict}"
+        text += "" if error is None else f" (NRMSE {_two(error)} over these runs)"
+        told = advised.get(channel.name, "")
+        if verdict != "usable" and not told.startswith("usable"):
+            text += f"; the fit says: {told}" if told else ""
+        items.append(element("li", text))
+    return element("ul", *items)
 
 
 def _two(value: float | None) -> str:
@@ -300,12 +322,18 @@ def decisions(name: str, validation: Validation) -> Markup:
 def eigenvalues(name: str, validation: Validation) -> Markup:
     """Eigenvalues per schedule point, conjugate pairs on one line, unstable ones marked."""
     schedule = next(iter(validation.models.values())).schedule
+    data = validation.record.get("data", ())
+    seconds = max((run.get("seconds", 0.0) for run in data), default=0.0)
+    # Whether the model is unstable is not for its linear part to say.
+    whole = all(model.e is None for model in validation.models.values())
     rows = []
     for point, values in validation.eigenvalues:
         where = f"{schedule} = {number(float(point))}" if schedule else "all conditions"
         for value in _upper(values):
             size = abs(value)
-            unstable = value.real > 0
+            growth = Growth(float(point), value.real, seconds)
+            unstable = growth.unstable and whole
+            word = growth.word if growth.integrates else "stable" if value.real <= 0 else "grows"
             pair = f"± {number(value.imag)}" if value.imag > 0 else MISSING
             rows.append(
                 [
@@ -314,7 +342,7 @@ def eigenvalues(name: str, validation: Validation) -> Markup:
                     Cell(pair, "num"),
                     size / (2 * np.pi) if value.imag > 0 else None,
                     -value.real / size if value.imag > 0 else None,
-                    Cell("unstable", "bad") if unstable else "stable",
+                    Cell("unstable", "bad") if unstable else word,
                 ]
             )
     return table(

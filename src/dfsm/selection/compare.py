@@ -20,8 +20,11 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from dfsm.core.bundle import MANIFEST
+from dfsm.core.bundle import MANIFEST, is_as_written, signed
+from dfsm.core.exchange import recover
+from dfsm.core.fallback import write_or_keep
 from dfsm.core.files import check_file, json_value, write_json
+from dfsm.core.lock import locked
 from dfsm.core.progress import track
 from dfsm.core.workers import default_jobs, work_through
 from dfsm.data.dataset import Dataset
@@ -34,6 +37,11 @@ from dfsm.selection.trial import Candidate, Course, Outcome, try_out
 
 HOLD_OUT = 0.2
 _FORMAT = 1
+# Keys of results that version 0.1 wrote.
+_UNSIGNED = (
+    *("format", "outcome", "model", "fingerprint", "changes", "settings", "refine"),
+    *("training", "validation"),
+)
 # Names become those of folders, on any system.
 _NAME = re.compile(r"\w[\w+-]*")
 _Task = tuple[str, Candidate]
@@ -110,6 +118,14 @@ class Ranking:
         failed = [c for c in self.candidates if c.status == "failed"]
         return [f"candidate {c.name} could not be fitted: {c.outcome.message}" for c in failed]
 
+    def discarded(self) -> list[str]:
+        """One sentence per candidate that is not what was asked for: its refinement failed."""
+        return [
+            f"candidate {c.name} is not refined: {c.outcome.discarded}"
+            for c in self.candidates
+            if c.outcome.discarded
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values of all figures."""
         entries = [
@@ -182,17 +198,9 @@ def compare(
     check_output(output, candidates)
     training, judged = _shares(runs, validation, hold_out, next(iter(candidates.values())))
     course = Course.of(training, judged, next(iter(candidates.values())).settings)
-    marks = {name: c.fingerprint(course) for name, c in candidates.items()}
-    output.mkdir(exist_ok=True)
-    outcomes = {n: kept for n, mark in marks.items() if (kept := _kept(output, n, mark))}
-    kept = set(outcomes)
-    tasks: list[_Task] = [(n, c) for n, c in candidates.items() if n not in kept]
-    jobs = default_jobs() if jobs is None else jobs
-    work = work_through(_try_task, course, tasks, jobs)
-    for (name, candidate), (outcome, model) in track(work, "candidates", len(tasks)):
-        record = {"fingerprint": marks[name], **_account(candidate, course)}
-        _write(output, name, outcome, model, record)
-        outcomes[name] = outcome
+    with locked(output):
+        output.mkdir(exist_ok=True)
+        outcomes, kept = _outcomes(candidates, course, output, jobs)
     entries = [
         RankedCandidate(
             name=name,
@@ -267,6 +275,23 @@ def check_output(output: Path, candidates: Iterable[str]) -> None:
 # -- what is done ---------------------------------------------------------------------------------
 
 
+def _outcomes(
+    candidates: Mapping[str, Candidate], course: Course, output: Path, jobs: int | None
+) -> tuple[dict[str, Outcome], set[str]]:
+    """Outcome of every candidate, written as soon as it is known, and the names of those kept."""
+    marks = {name: c.fingerprint(course) for name, c in candidates.items()}
+    outcomes = {n: kept for n, mark in marks.items() if (kept := _kept(output, n, mark))}
+    kept = set(outcomes)
+    tasks: list[_Task] = [(n, c) for n, c in candidates.items() if n not in kept]
+    jobs = default_jobs() if jobs is None else jobs
+    work = work_through(_try_task, course, tasks, jobs)
+    for (name, candidate), (outcome, model) in track(work, "candidates", len(tasks)):
+        record = {"fingerprint": marks[name], **_account(candidate, course)}
+        _write(output, name, outcome, model, record)
+        outcomes[name] = outcome
+    return outcomes, kept
+
+
 def _try_task(course: Course, task: _Task) -> tuple[Outcome, DFSM | None]:
     return try_out(course, task[1])
 
@@ -329,13 +354,14 @@ def _write(
 ) -> None:
     """Model first: a result that stands belongs to the model beside it."""
     if model is not None:
-        save(model, output / name)
+        write_or_keep(lambda path: save(model, path), output / name)
     content = {"format": _FORMAT, "outcome": asdict(outcome), "model": _digest(output / name)}
-    write_json(_result_file(output, name), content | record)
+    write_json(_result_file(output, name), signed(content | record))
 
 
 def _kept(output: Path, name: str, fingerprint: str) -> Outcome | None:
     """The outcome of an earlier comparison if it still holds; removes what a killed one left."""
+    recover(output / name)
     for left in output.glob(f".{name}.*"):
         if left.is_dir():
             shutil.rmtree(left, ignore_errors=True)
@@ -358,7 +384,7 @@ def _kept(output: Path, name: str, fingerprint: str) -> Outcome | None:
 def _read(path: Path) -> dict[str, Any] | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != _FORMAT:
+        if content["format"] != _FORMAT or not is_as_written(content, _UNSIGNED):
             return None
         return content | {"outcome": TypeAdapter(Outcome).validate_python(content["outcome"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

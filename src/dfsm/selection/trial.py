@@ -14,17 +14,19 @@ import numpy as np
 from dfsm.core.files import json_value
 from dfsm.core.types import Array
 from dfsm.core.version import __version__
-from dfsm.data.derivatives import differentiate
+from dfsm.data.conversion import in_units_of
+from dfsm.data.derivatives import differentiate, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.fit import fit
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import with_computed
+from dfsm.numerics.time_mesh import weights_over_time
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.refine import RefineSettings
 from dfsm.simulation.simulate import Status, simulate
-from dfsm.validation.results import ChannelError, spread
+from dfsm.validation.results import ChannelError, spread, training_spreads
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,9 @@ class Course:
 
         Candidates with filters of their own would else each be judged by another record.
         """
-        references = tuple(_reference(run, settings) for run in validation)
-        return cls(tuple(training), tuple(validation), references)
+        judged = [in_units_of(r, training[0].channels, "the training runs") for r in validation]
+        references = tuple(_reference(run, settings) for run in judged)
+        return cls(tuple(training), tuple(judged), references)
 
     @property
     def reference_digest(self) -> str:
@@ -115,6 +118,8 @@ class Outcome:
         Number of coefficients of the derivative function.
     warnings
         What the fit warned of.
+    discarded
+        Why a refinement was not taken over; empty where it was, or none was asked for.
     """
 
     message: str = ""
@@ -124,6 +129,7 @@ class Outcome:
     simulate_seconds: float = 0.0
     parameters: int = 0
     warnings: tuple[str, ...] = ()
+    discarded: str = ""
 
 
 def try_out(course: Course, candidate: Candidate) -> tuple[Outcome, DFSM | None]:
@@ -139,7 +145,10 @@ def try_out(course: Course, candidate: Candidate) -> tuple[Outcome, DFSM | None]
         return Outcome(message=str(error)), None
     notes = tuple(str(w.message) for w in caught if issubclass(w.category, DfsmWarning))
     seconds = sum(result.seconds.values())
-    return replace(outcome, fit_seconds=seconds, warnings=notes), result.model
+    refinement = result.model.provenance.record.get("refinement", {})
+    discarded = "" if refinement.get("improved", True) else refinement["message"]
+    outcome = replace(outcome, fit_seconds=seconds, warnings=notes, discarded=discarded)
+    return outcome, result.model
 
 
 def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
@@ -149,12 +158,8 @@ def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
     diverged = sum(s.status is not Status.COMPLETED for s in simulations)
     pairs = list(zip((s.trajectory for s in simulations), course.references, strict=True))
     measured = [c.name for c in model.signals.observed if c.name in course.references[0]]
-    nrmse = {
-        n: None
-        if diverged
-        else float(np.mean([ChannelError.of(x[n], r[n]).nrmse for x, r in pairs]))
-        for n in measured
-    }
+    usual = training_spreads(model)
+    nrmse = {n: None if diverged else _mean_nrmse(pairs, n, usual[n]) for n in measured}
     return Outcome(
         nrmse=nrmse,
         diverged=diverged,
@@ -163,9 +168,22 @@ def _judge(model: DFSM, course: Course, settings: FitSettings) -> Outcome:
     )
 
 
+def _mean_nrmse(
+    pairs: Sequence[tuple[Trajectory, Mapping[str, Array]]], name: str, usual: float
+) -> float:
+    """Over the runs in which a state moves; over all where it moves in none."""
+    errors = [
+        (ChannelError.of(x[name], r[name], weights_over_time([x.time])), r[name]) for x, r in pairs
+    ]
+    moving = [e.unless_still(recorded, usual).nrmse for e, recorded in errors]
+    known = [v for v in moving if not np.isnan(v)]
+    return float(np.mean(known or [e.nrmse for e, _ in errors]))
+
+
 def _reference(run: Trajectory, settings: FitSettings) -> dict[str, Array]:
     run = with_computed(run, settings.hub_height, settings.features)
-    rates = differentiate(run, settings.states, settings.derivatives)
+    head = lead_in(run, settings.start, settings.derivatives)
+    rates = differentiate(head, settings.states, settings.derivatives)
     recorded = run.window(settings.start, settings.stop)
     extracted = rates.trajectory.window(settings.start, settings.stop)
     values = {n: recorded[n] if n in recorded else extracted[n] for n in rates.names}

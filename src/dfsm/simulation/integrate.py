@@ -13,21 +13,36 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import CubicSpline
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array
+from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.runge_kutta import rk4_step
+from dfsm.simulation.inputs import Pieces, at_parts, each, interpolated, pieces_of
+
+__all__ = [
+    "Case",
+    "Drive",
+    "Mesh",
+    "Pieces",
+    "Rollout",
+    "adapt",
+    "at_steps",
+    "march",
+    "mesh_of",
+    "pieces_of",
+    "rk4",
+    "stages",
+]
 
 # Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 1000
 _MAX_STEPS = 1_000_000
 # Fixed steps of one run, whose inputs and states are all held in memory.
 _MOST_STEPS = 10_000_000
-# Share of a channel's range by which inputs may leave a polynomial without a bend: rounding.
-_STRAIGHT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -42,11 +57,15 @@ class Mesh:
         Controls, disturbances and parameters at those times, ``(2 step + 1, exogenous)``.
     every
         Steps per sample of the run.
+    held
+        Which inputs are the same throughout each step, as in its middle, ``(exogenous,)``; None
+        where none is.
     """
 
     time: Array
     inputs: Array
     every: int
+    held: NDArray[np.bool_] | None = None
 
     @property
     def steps(self) -> int:
@@ -54,29 +73,10 @@ class Mesh:
         return len(self.time) // 2
 
 
-@dataclass(frozen=True)
-class Pieces:
-    """Inputs at every time, as a polynomial between each two samples of a run.
-
-    Attributes
-    ----------
-    time
-        The run's samples in s, ``(sample,)``.
-    coefficients
-        Of the powers three to none of the time since the sample before,
-        ``(4, sample - 1, exogenous)``.
-    bends
-        Samples at which one polynomial does not go on as the other, in s, ``(bend,)``.
-    """
-
-    time: Array
-    coefficients: Array
-    bends: Array
-
-
 Drive = TypeVar("Drive", Mesh, Pieces)
 # Length of a step, and exogenous inputs at its start, middle and end.
 _Drive = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+Stages = tuple[jax.Array, jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Rollout:
     solved: bool
 
 
-def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
+def mesh_of(driven: Trajectory, step: float | None, between: Between | Sequence[Between]) -> Mesh:
     """Divide the intervals between samples into steps and interpolate the inputs.
 
     Parameters
@@ -131,8 +131,8 @@ def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
         The exogenous channels of one run.
     step
         Largest step in s; None makes one step per sample.
-    interpolation
-        ``"linear"`` or ``"cubic"`` spline.
+    between
+        What inputs do between samples: one kind for all, or one each.
 
     Raises
     ------
@@ -151,57 +151,22 @@ def mesh_of(driven: Trajectory, step: float | None, interpolation: str) -> Mesh:
         )
     every = max(1, int(np.ceil(parts)))
     parts = np.arange(2 * every) / (2 * every)
-    time = _between(driven.time[:, None], parts)[:, 0]
-    if interpolation == "cubic":
-        inputs = CubicSpline(driven.time, driven.values)(time)
-    else:
-        inputs = _between(driven.values, parts)
-    return Mesh(time, inputs, every)
+    time = at_parts(driven.time[:, None], parts)[:, 0]
+    kinds = each(driven, between)
+    held = np.array([kind == "hold" for kind in kinds], dtype=bool)
+    inputs = interpolated(driven, kinds, parts)
+    return Mesh(time, inputs, every, held if held.any() else None)
 
 
-def pieces_of(driven: Trajectory, interpolation: str) -> Pieces:
-    """Interpolate the inputs between samples.
-
-    Parameters
-    ----------
-    driven
-        The exogenous channels of one run.
-    interpolation
-        ``"linear"`` or ``"cubic"`` spline, the same as `mesh_of` evaluates.
-    """
-    time, values = driven.time, driven.values
-    steps = np.diff(time)[:, None]
-    if interpolation == "cubic":
-        coefficients = CubicSpline(time, values).c
-        degree, leading = 3, coefficients[0]
-    else:
-        degree, leading = 1, np.diff(values, axis=0) / steps
-        coefficients = np.stack([0 * leading, 0 * leading, leading, values[:-1]])
-    # How far the one polynomial, carried on over the next interval, misses the other.
-    missed = np.abs(np.diff(leading, axis=0)) * np.maximum(steps[1:], steps[:-1]) ** degree
-    least = _STRAIGHT * np.ptp(values, axis=0) + 8 * np.spacing(np.abs(values).max(axis=0))
-    return Pieces(time, coefficients, time[1:-1][(missed > least).any(axis=1)])
-
-
-def at_steps(field: Trajectory, mesh: Mesh, interpolation: str) -> Array:
+def at_steps(field: Trajectory, mesh: Mesh, between: Between) -> Array:
     """What drives outputs alone, at the ends of all steps, ``(step + 1, channel)``.
 
     Interpolated as `mesh_of` does with the inputs.
     """
     if mesh.every == 1 or not field.channels:
         return field.values
-    time = mesh.time[::2]
-    if interpolation == "cubic":
-        return CubicSpline(field.time, field.values)(time)
-    return _between(field.values, np.arange(mesh.every) / mesh.every)
-
-
-def _between(values: Array, parts: Array) -> Array:
-    """Values at fractions of every interval between rows, and the last row."""
-    steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
-    return np.concatenate(
-        [(values[:-1, None, :] + steps).reshape(-1, values.shape[1]), values[-1:]]
-    )
+    kinds = (between,) * len(field.channels)
+    return interpolated(field, kinds, np.arange(mesh.every) / mesh.every)
 
 
 # -- fixed steps --------------------------------------------------------------------------------
@@ -245,7 +210,9 @@ def _march_batch(model: DFSM, cases: Sequence[Case[Mesh]]) -> list[Rollout]:
     field = np.zeros((len(cases), padded + 1, cases[0].field.shape[1]))
     for i, c in enumerate(cases):
         field[i, : len(c.field)] = c.field
-    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, (inputs, field)))
+    held = cases[0].drive.held
+    drive = (inputs, field, held)
+    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, drive))
     rollouts = []
     for i, m in enumerate(c.drive for c in cases):
         rows = slice(0, m.steps + 1, m.every)
@@ -255,19 +222,41 @@ def _march_batch(model: DFSM, cases: Sequence[Case[Mesh]]) -> list[Rollout]:
 
 @eqx.filter_jit
 def _march(
-    model: DFSM, x0: Array, psi0: Array, h: Array, drive: tuple[Array, Array]
+    model: DFSM,
+    x0: Array,
+    psi0: Array,
+    h: Array,
+    drive: tuple[Array, Array, NDArray[np.bool_] | None],
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    model, (inputs, field) = model.prepared(), map(jnp.asarray, drive)
+    model, (inputs, field) = model.prepared(), map(jnp.asarray, drive[:2])
 
     def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
-        return rk4(model, x0, h, v)
+        return rk4(model, x0, h, stages(v, drive[2]))
 
     xs = jax.vmap(states)(jnp.asarray(x0), jnp.asarray(h), inputs)
     seen = observe(model, jnp.asarray(h), xs, (inputs[:, ::2], field), jnp.asarray(psi0))
     return xs, *seen
 
 
-def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = np.inf) -> jax.Array:
+def stages(v: jax.Array, held: NDArray[np.bool_] | jax.Array | None) -> Stages:
+    """Inputs at the start, the middle and the end of every step, each ``(step, exogenous)``.
+
+    Parameters
+    ----------
+    v
+        At ends and middles, ``(2 step + 1, exogenous)``.
+    held
+        Which are the same throughout each step, as in its middle, ``(exogenous,)``; None for none.
+    """
+    begin, middle, end = v[:-2:2], v[1::2], v[2::2]
+    if held is None:
+        return begin, middle, end
+    return jnp.where(held, middle, begin), middle, jnp.where(held, middle, end)
+
+
+def rk4(
+    model: DFSM, x0: jax.Array, h: jax.Array, drive: Stages, bound: float = np.inf
+) -> jax.Array:
     """Classical RK4 over steps of any lengths; JAX can follow it.
 
     Parameters
@@ -278,8 +267,8 @@ def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = n
         Initial states ``(state,)``.
     h
         Steps in s ``(step,)``; a step of zero changes nothing.
-    v
-        Exogenous inputs at ends and middles of the steps ``(2 step + 1, exogenous)``.
+    drive
+        Exogenous inputs along the steps, see `stages`.
     bound
         States are held within this many training half-ranges of the range's middle.
 
@@ -290,13 +279,13 @@ def rk4(model: DFSM, x0: jax.Array, h: jax.Array, v: jax.Array, bound: float = n
     """
     low, high = clip_range(model, bound)
 
-    def step(x: jax.Array, drive: _Drive) -> tuple[jax.Array, jax.Array]:
-        x, _ = rk4_step(partial(rate, model), x, drive[0], drive[1:])
+    def step(x: jax.Array, along: _Drive) -> tuple[jax.Array, jax.Array]:
+        x, _ = rk4_step(partial(rate, model), x, along[0], along[1:])
         if np.isfinite(bound):
             x = jnp.clip(x, low, high)
         return x, x
 
-    _, xs = jax.lax.scan(step, x0, (h, v[:-2:2], v[1::2], v[2::2]))
+    _, xs = jax.lax.scan(step, x0, (h, *drive))
     return jnp.concatenate([x0[None], xs])
 
 
@@ -356,13 +345,18 @@ def adapt(model: DFSM, case: Case[Pieces], method: str, tolerances: tuple[float,
     """
     drive = case.drive
     # At least one, and their number is compiled in: bends beyond the end change nothing.
-    bends = np.full((len(drive.bends) // _PAD + 1) * _PAD, np.inf)
-    bends[: len(drive.bends)] = drive.bends
+    bends = np.full((2, (len(drive.bends) // _PAD + 1) * _PAD), np.inf)
+    bends[:, : len(drive.bends)] = drive.bends, drive.after
     # Tolerances as arrays: a Python number would be compiled in, and another compile again.
     start = (case.x0, case.psi0, case.field)
-    arrays = (drive.time, drive.coefficients, bends, *tolerances)
+    path = (drive.time, drive.values, drive.starts, drive.coefficients)
     states, outputs, outside, solved = _adapt(
-        model, *map(jnp.asarray, arrays), start=tuple(map(jnp.asarray, start)), method=method
+        model,
+        tuple(map(jnp.asarray, path)),
+        tuple(map(jnp.asarray, bends)),
+        tuple(map(jnp.asarray, tolerances)),
+        start=tuple(map(jnp.asarray, start)),
+        method=method,
     )
     return Rollout(np.asarray(states), np.asarray(outputs), np.asarray(outside), bool(solved))
 
@@ -370,23 +364,28 @@ def adapt(model: DFSM, case: Case[Pieces], method: str, tolerances: tuple[float,
 @eqx.filter_jit
 def _adapt(
     model: DFSM,
-    samples: jax.Array,
-    coefficients: jax.Array,
-    bends: jax.Array,
-    rtol: jax.Array,
-    atol: jax.Array,
+    path: tuple[jax.Array, ...],
+    bends: tuple[jax.Array, ...],
+    tolerances: tuple[jax.Array, ...],
     *,
     start: tuple[jax.Array, ...],
     method: str,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     import diffrax
 
+    from dfsm.simulation.bends import EndingAtBends
+
+    (samples, values, starts, coefficients), (rtol, atol) = path, tolerances
     x0, psi0, field = start
-    d, c, b, a = coefficients
-    path = diffrax.CubicInterpolation(samples, (d, c, b, a))
+
+    def inputs(t: jax.Array) -> jax.Array:
+        piece = jnp.maximum(jnp.searchsorted(starts, t, side="right") - 1, 0)
+        (d, c, b, a), since = coefficients[:, piece], t - starts[piece]
+        return a + since * (b + since * (c + since * d))
+
     spread = model.region.std[model.signals.state_columns]
     spread = jnp.where(spread > 0, spread, 1.0)
-    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, path.evaluate(t)) / spread)
+    term = diffrax.ODETerm(lambda t, z, _: rate(model, z * spread, inputs(jnp.asarray(t))) / spread)
     solution = diffrax.diffeqsolve(
         term,
         diffrax.Tsit5() if method == "tsit5" else diffrax.Kvaerno5(),
@@ -396,13 +395,14 @@ def _adapt(
         # Scaled by their spread all states share one absolute tolerance.
         y0=x0 / spread,
         saveat=diffrax.SaveAt(ts=samples),
-        stepsize_controller=diffrax.ClipStepSizeController(
-            diffrax.PIDController(rtol=rtol, atol=atol), jump_ts=bends
+        stepsize_controller=EndingAtBends(  # its fields; diffrax's bases are abstract
+            controller=diffrax.PIDController(rtol=rtol, atol=atol),  # pyright: ignore[reportCallIssue]
+            begins=bends[0],
+            ends=bends[1],
         ),
         max_steps=_MAX_STEPS,
         throw=False,
     )
     states = jnp.asarray(solution.ys) * spread
-    v = jnp.concatenate([a, path.evaluate(samples[-1])[None]])
-    outputs, outside = observe(model, jnp.diff(samples), states, (v, field), psi0)
+    outputs, outside = observe(model, jnp.diff(samples), states, (values, field), psi0)
     return states, outputs, outside, solution.result == diffrax.RESULTS.successful

@@ -9,7 +9,7 @@ import enum
 import time as clock
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args, overload
 
 import numpy as np
@@ -18,12 +18,17 @@ from numpy.typing import ArrayLike
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
+from dfsm.data.between import Between, Chosen
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
+from dfsm.models.completion import all_completed, completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state
-from dfsm.models.signals import require_constant, require_field, with_computed
+from dfsm.models.recorded import recorded_states
+from dfsm.models.signals import require_constant, require_field
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
+from dfsm.simulation.fastest import REACH, fastest_rate
 from dfsm.simulation.integrate import (
     Case,
     Drive,
@@ -46,6 +51,9 @@ _HISTORY = 5.0
 _HISTORY_SAMPLES = 100
 _HEAD = 1.0
 _HEAD_SAMPLES = 20
+# Times as many RK4 steps from which a stiff method takes their place, and beyond which none would
+# get anywhere.
+_SWITCHED, _HOPELESS = 100, 1e6
 
 
 Method = Literal["rk4", "tsit5", "kvaerno5"]
@@ -62,18 +70,21 @@ class SimulationSettings:
         ``"rk4"``: classical Runge-Kutta with fixed steps. ``"tsit5"``: adaptive explicit
         (Tsitouras 2011). ``"kvaerno5"``: adaptive, for stiff models (Kværnø 2004).
     step
-        Largest step of ``"rk4"`` in s; None takes the run's own samples.
+        Largest step of ``"rk4"`` in s; None takes the run's own samples. Where the model moves too
+        fast for it, steps are shorter, or the method is ``"kvaerno5"``, and that is told.
     rtol, atol
         Tolerances of the adaptive methods; `atol` is relative to each state's training spread.
     interpolation
-        Inputs between samples: ``"linear"`` or ``"cubic"`` spline.
+        Inputs between samples: ``"hold"``, ``"linear"`` or ``"cubic"`` spline, for all or by name;
+        None does as the model does. A wind field, which drives outputs alone, is joined by lines
+        unless all are splines.
     """
 
     method: Method = "rk4"
     step: float | None = None
     rtol: float = 1e-6
     atol: float = 1e-8
-    interpolation: Literal["linear", "cubic"] = "linear"
+    interpolation: Chosen = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
         if self.step is not None and not self.step > 0:
@@ -112,9 +123,11 @@ class Simulation:
     reason
         For a rollout that did not complete, the state that left the range and where; else "".
     outside
-        Share of the samples with any input outside its training range.
+        Share of the time with any input outside its training range.
     wall_time
         Seconds it took (of the whole batch divided by its runs), without compilation when warm.
+    note
+        What was done otherwise than asked for: shorter steps, or another method; else "".
     """
 
     trajectory: Trajectory
@@ -123,6 +136,7 @@ class Simulation:
     reason: str
     outside: float
     wall_time: float = 0.0
+    note: str = ""
 
     def __repr__(self) -> str:
         run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
@@ -134,9 +148,10 @@ class Simulation:
     @property
     def message(self) -> str:
         """One sentence on the outcome."""
+        more = f"; {self.note}" if self.note else ""
         if self.status is Status.COMPLETED:
-            return f"{self.outside:.1%} of the time outside the training range"
-        return f"{self.reason}; {self.status.value}"
+            return f"{self.outside:.1%} of the time outside the training range{more}"
+        return f"{self.reason}; {self.status.value}{more}"
 
 
 @overload
@@ -196,18 +211,19 @@ def simulate(
     Raises
     ------
     DfsmError
-        A channel is missing or not finite, a parameter varies within a run, the window is too
-        short, or the step too small for it.
+        A channel is missing, not finite or of another dimension than the model's, a parameter
+        varies within a run, the window is too short, or the step too small for it.
 
     Warns
     -----
     DfsmWarning
-        A rollout was outside the training range for part of the time, or ended early.
+        Channels were converted to the model's units, a rollout was outside the training range for
+        part of the time, took shorter steps than asked for, or ended early.
     """
     settings = settings or SimulationSettings()
     single = isinstance(runs, Trajectory)
     batch = [runs] if isinstance(runs, Trajectory) else list(runs)
-    batch = [with_computed(r, model.signals.hub_height, model.signals.features) for r in batch]
+    batch = all_completed(batch, model.signals)
     if not batch:
         raise DfsmError("no runs were given to simulate")
     names = model.signals.exogenous
@@ -222,6 +238,9 @@ def simulate(
         require_constant(run, model.signals.names("parameters"))
     starts = None if initial is None else _starts(model, initial, len(batch))
 
+    between = model.signals.between_samples(settings.interpolation)
+    beside: Between = "cubic" if settings.interpolation == "cubic" else "linear"
+
     def case(i: int, drive: Drive, field: Array) -> Case[Drive]:
         begins = float(driven[i].time[0])
         x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
@@ -230,24 +249,56 @@ def simulate(
         return Case(drive, x0, initial_azimuth(model, batch[i], begins), field)
 
     def marched(i: int) -> Case[Mesh]:
-        mesh = mesh_of(driven[i], settings.step, between)
-        return case(i, mesh, at_steps(fields[i], mesh, between))
+        mesh = mesh_of(driven[i], steps[i].largest, between)
+        return case(i, mesh, at_steps(fields[i], mesh, beside))
 
     begin = clock.perf_counter()
-    each, between = range(len(batch)), settings.interpolation
-    if settings.method == "rk4":
-        solved = march(model, (marched(i) for i in each))
-    else:
-        tolerances = (settings.rtol, settings.atol)
-        cases = (case(i, pieces_of(driven[i], between), fields[i].values) for i in each)
-        solved = (adapt(model, c, settings.method, tolerances) for c in cases)
+    each = range(len(batch))
+    steps = [_stepping(model, run, settings) for run in driven]
+    fixed = [i for i in each if steps[i].method == "rk4"]
+    tolerances = (settings.rtol, settings.atol)
+
+    def adapted(i: int) -> Rollout:
+        one = case(i, pieces_of(driven[i], between), fields[i].values)
+        return adapt(model, one, steps[i].method, tolerances)
+
+    marching = march(model, (marched(i) for i in fixed)) if fixed else iter(())
+    solved = (next(marching) if steps[i].method == "rk4" else adapted(i) for i in each)
     results = [
-        _result(model, r, d, rollout) for r, d, rollout in zip(batch, driven, solved, strict=True)
+        replace(_result(model, r, d, rollout), note=step.note)
+        for r, d, rollout, step in zip(batch, driven, solved, steps, strict=True)
     ]
     wall = (clock.perf_counter() - begin) / len(batch)
     results = [replace(r, wall_time=wall) for r in results]
     _warn(results)
     return results[0] if single else results
+
+
+@dataclass(frozen=True)
+class _Stepping:
+    """How one run is marched: the method, the largest step of RK4 in s, and what is to be told."""
+
+    method: str
+    largest: float | None
+    note: str = ""
+
+
+def _stepping(model: DFSM, driven: Trajectory, settings: SimulationSettings) -> _Stepping:
+    """Steps that RK4 can take with this model; very many of them are left to a stiff method."""
+    asked = settings.step
+    if settings.method != "rk4":
+        return _Stepping(settings.method, asked)
+    longest = float(np.diff(driven.time).max())
+    step = longest if asked is None else min(asked, longest)
+    rate = fastest_rate(model, driven.values)
+    parts = rate * step / REACH
+    # Beyond the second limit, no method would get anywhere.
+    if not 1 + 1e-9 < parts < _HOPELESS:
+        return _Stepping("rk4", asked)
+    why = f"{step:.3g} s are too long for RK4 with the model's fastest eigenvalue, {rate:.3g} 1/s"
+    if parts > _SWITCHED:
+        return _Stepping("kvaerno5", asked, f"integrated by kvaerno5: steps of {why}")
+    return _Stepping("rk4", step / parts, f"integrated in steps of {step / parts:.3g} s: {why}")
 
 
 def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
@@ -267,6 +318,7 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
     ndarray
         Shape ``(state,)``.
     """
+    run = completed(run, model.signals)
     latent = latent_state(model, run, start)
     return np.concatenate([_observed_state(model, run, start), latent])
 
@@ -287,12 +339,14 @@ def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     s = model.signals
     measured = [n for spec in s.specs for n in (spec.name, spec.rate) if n is not None]
     specs = [replace(spec, acceleration=None) for spec in s.specs]
-    run = run.select(dict.fromkeys(measured))
+    driving = [n for n in s.exogenous if n not in measured and n in run]
+    run = run.select(dict.fromkeys((*measured, *driving)))
     if all(spec.order == 1 or spec.rate for spec in specs):
         index = int(np.argmin(np.abs(run.time - start)))
         # Two samples make a trajectory, whose check says which channel is not finite and when.
         near = slice(max(0, index - 1), index + 1) if index else slice(0, 2)
-        replace(run, time=run.time[near], values=run.values[near]).require_finite()
+        near_by = replace(run, time=run.time[near], values=run.values[near])
+        near_by.select(dict.fromkeys(measured)).require_finite()
         values = dict(zip(run.names, run.values[index], strict=True))
         rates = [values[spec.rate] for spec in specs if spec.rate and spec.order == 2]
         return np.array([values[spec.name] for spec in specs] + rates)
@@ -303,7 +357,11 @@ def _observed_state(model: DFSM, run: Trajectory, start: float) -> Array:
     else:
         head = max(start + _HEAD, float(run.time[min(len(run), _HEAD_SAMPLES) - 1]))
         piece, row = run.window(start, head), 0
-    extracted = differentiate(piece.require_finite(), specs, s.derivatives)
+    piece.select(dict.fromkeys(measured)).require_finite()
+    if "hold" in s.between and len(driving) == len(s.exogenous) and not s.latents:
+        seen = recorded_states(model, piece)
+        return seen.trajectory.select(seen.found.names).values[row]
+    extracted = differentiate(piece, specs, s.derivatives)
     return extracted.trajectory.select(extracted.names).values[row]
 
 
@@ -350,14 +408,22 @@ def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) 
         status=status,
         ended=float(time[end - 1]),
         reason=reason,
-        outside=float(rollout.outside[:end].mean()),
+        outside=float(mean_over(rollout.outside[:end], _weights(driven.time[:end]))),
     )
+
+
+def _weights(time: Array) -> Array | None:
+    return None if len(time) < 2 else weights_over_time([time])
 
 
 def _warn(results: Sequence[Simulation]) -> None:
     ended = [r for r in results if r.status is not Status.COMPLETED]
     for r in ended:
         warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=3)
+    cut = [r for r in results if r.note and r.status is Status.COMPLETED]
+    if cut:
+        more = f" ({len(cut)} of the {len(results)} rollouts alike)" if len(cut) > 1 else ""
+        warnings.warn(f"{cut[0].trajectory.name}: {cut[0].note}{more}", DfsmWarning, stacklevel=3)
     outside = [r for r in results if r.status is Status.COMPLETED and r.outside > MUCH_OUTSIDE]
     if outside:
         worst = max(outside, key=lambda r: r.outside)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dfsm.core.types import Array
+from dfsm.data.conversion import in_units_of, tell_converted
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.simulators.excitation import Excitation, Uniform, excite
@@ -83,7 +84,9 @@ def as_signal(
         The shape does not fit, a sample is not finite, or the signal does not cover the time.
     """
     if isinstance(source, Trajectory):
-        names = [c.name for c in channels]
+        names, own = [c.name for c in channels], source
+        source = in_units_of(own, channels, "the system")
+        tell_converted([own], [source])
         source = interpolated(source.time, source.select(names).require_finite().values)
     if isinstance(source, get_args(Excitation)):
         raise DfsmError(f"{what}: a {type(source).__name__}, draw a signal from it with excite")

@@ -18,8 +18,8 @@ from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
+from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.signals import with_computed
 from dfsm.simulation.simulate import SimulationSettings, Status
 from dfsm.validation.intervals import Intervals, interpolated, schedule_along
 from dfsm.validation.validate import listed, of_the_fit, validate
@@ -65,7 +65,7 @@ def calibrate(
     """
     require(0 < level < 1, "level", level, "a share between 0 and 1")
     s = model.signals
-    runs = [with_computed(run, s.hub_height, s.features) for run in runs]
+    runs = all_completed(list(runs), s)
     if len(runs) < _FEWEST:
         raise DfsmError(
             f"intervals are calibrated on at least {_FEWEST} runs, {len(runs)} were given"
@@ -98,6 +98,7 @@ def calibrate(
         runs=tuple(r.name for r in runs),
         digests=tuple(r.select(s.recorded).digest for r in runs),
         warnings=tuple(_leaks(model, runs)),
+        schedule_unit=next((c.unit for c in s.inputs if c.name == model.schedule), ""),
     )
 
 

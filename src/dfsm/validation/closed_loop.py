@@ -15,16 +15,16 @@ import numpy as np
 
 from dfsm.controllers.controller import Controller
 from dfsm.core.files import json_value
-from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import hushed
+from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.signals import with_computed
+from dfsm.models.recorded import recorded_states
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 from dfsm.simulation.simulate import Simulation, Status, simulate
 from dfsm.validation.results import ChannelError, ChannelStatistics
-from dfsm.validation.validate import all_statistics, frequency_bands, recorded_states
+from dfsm.validation.validate import all_statistics, frequency_bands, recorded_channels
 
 # Wöhler exponent of the one damage-equivalent load in tables.
 SHOWN_EXPONENT = "4"
@@ -187,7 +187,7 @@ def validate_closed_loop(
         As `closed_loop`, or a run lacks a channel to compare with.
     """
     s = model.signals
-    runs = [with_computed(run, s.hub_height, s.features) for run in runs]
+    runs = [completed(run, s) for run in runs]
     for run in runs:
         run.columns(s.recorded)
     with hushed():
@@ -215,8 +215,8 @@ def _compare(
     first = float(loop.trajectory.time[0]) if done else window[0]
     last = float(loop.trajectory.time[-1]) if done else window[1]
     part = run.window(first, last)
-    rates = differentiate(run, s.specs, s.derivatives).trajectory.window(first, last)
-    recorded = recorded_states(model, part, rates)
+    rates = recorded_states(model, run, first).trajectory.window(first, last)
+    recorded = recorded_channels(model, part, rates)
     recorded = recorded.with_channels(s.controls, part.select(s.names("controls")).values)
     with hushed():
         replay = simulate(model, run, start=first, stop=last)

@@ -6,6 +6,7 @@ How wrong a rollout is depends on the wind: half-widths follow the schedule. `ca
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,15 +14,20 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from dfsm.core.bundle import is_as_written, signed
 from dfsm.core.files import check_format, existing_file, write_json
 from dfsm.core.types import Array
+from dfsm.core.units import agree
 from dfsm.core.version import __version__
+from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Channel, Trajectory, labels
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.simulate import Simulation
 
 _FORMAT = 1
+_UNSIGNED = ("format", "dfsm", "level", "schedule", "grid", "channels", "runs", "warnings")
 _AGAIN = "make it again with dfsm calibrate"
 
 
@@ -45,6 +51,8 @@ class Intervals:
         Names of the calibration runs, and SHA-256 of what the model reads of them.
     warnings
         What a reader should know before trusting them.
+    schedule_unit
+        Unit of the schedule; none in files that say nothing of it.
     """
 
     channels: tuple[str, ...]
@@ -56,6 +64,7 @@ class Intervals:
     runs: tuple[str, ...]
     digests: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    schedule_unit: str = ""
 
     def check(self, model: DFSM) -> None:
         """Refuse to stand around rollouts of another model.
@@ -68,7 +77,7 @@ class Intervals:
         s, named = model.signals, zip(self.channels, self.units, strict=True)
         ours, theirs = tuple(Channel(*c) for c in named), (*s.observed, *s.outputs)
         grid = np.asarray(model.region.grid)
-        if [(c.name, c.unit) for c in ours] != [(c.name, c.unit) for c in theirs]:
+        if not _same_channels(ours, theirs):
             what, ours, theirs = "channels are", labels(ours), labels(theirs)
         elif self.schedule != model.schedule:
             what, ours, theirs = "schedule is", self.schedule or "none", model.schedule or "none"
@@ -91,6 +100,8 @@ class Intervals:
         run
             What drove it; holds the schedule.
         """
+        if self.schedule is not None:
+            run = in_units_of(run, [Channel(self.schedule, self.schedule_unit)])
         middle = rollout.trajectory.select(self.channels)
         half = interpolated(self.grid, self.half_width, schedule_along(self.schedule, run, middle))
         low, high = (
@@ -113,10 +124,11 @@ class Intervals:
         return rollout.trajectory.with_channels(ends, values)
 
     def coverage(self, rollout: Simulation, run: Trajectory, recorded: Trajectory) -> Array:
-        """Share of the samples whose recorded value lies inside, shape ``(channel,)``."""
+        """Share of the time in which the recorded value lies inside, shape ``(channel,)``."""
         low, high = (part.values for part in self.around(rollout, run))
         truth = recorded.select(self.channels).values[: len(low)]
-        return ((truth >= low) & (truth <= high)).mean(axis=0)
+        weights = weights_over_time([recorded.time[: len(low)]])
+        return mean_over((truth >= low) & (truth <= high), weights)
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file; an existing one is replaced when the new one is complete.
@@ -133,12 +145,13 @@ class Intervals:
             "dfsm": __version__,
             "level": self.level,
             "schedule": self.schedule,
+            "schedule_unit": self.schedule_unit,
             "grid": self.grid.tolist(),
             "channels": [{"name": n, "unit": u, "half_width": h} for n, u, h in named],
             "runs": [{"name": name, "sha256": digest} for name, digest in runs],
             "warnings": self.warnings,
         }
-        write_json(path, content)
+        write_json(path, signed(content))
 
 
 class _Channel(BaseModel):
@@ -157,6 +170,7 @@ class _File(BaseModel):
 
     level: Annotated[float, Field(gt=0, lt=1)]
     schedule: str | None
+    schedule_unit: str = ""
     grid: Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=1)]
     channels: Annotated[list[_Channel], Field(min_length=1)]
     runs: list[_Run]
@@ -199,6 +213,8 @@ def load_intervals(path: str | Path) -> Intervals:
     points = len(content.grid)
     if any(len(c.half_width) != points for c in content.channels):
         raise _foreign(path, f"a channel has not one half-width for each of {points} grid points")
+    if not is_as_written(raw, _UNSIGNED):
+        raise DfsmError(f"{path} is damaged, it is not as it was written: {_AGAIN}")
     return Intervals(
         channels=tuple(c.name for c in content.channels),
         units=tuple(c.unit for c in content.channels),
@@ -209,6 +225,13 @@ def load_intervals(path: str | Path) -> Intervals:
         runs=tuple(r.name for r in content.runs),
         digests=tuple(r.sha256 for r in content.runs),
         warnings=tuple(content.warnings),
+        schedule_unit=content.schedule_unit,
+    )
+
+
+def _same_channels(ours: Sequence[Channel], theirs: Sequence[Channel]) -> bool:
+    return len(ours) == len(theirs) and all(
+        a.name == b.name and agree(a.unit, b.unit) for a, b in zip(ours, theirs, strict=True)
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,12 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import printable
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.spectra import Spectrum
+from dfsm.numerics.time_mesh import mean_over, std_over
 from dfsm.simulation.simulate import MUCH_OUTSIDE, Simulation, Status
 from dfsm.validation.intervals import Intervals
 
+# Share of its training spread below which a signal is at rest: errors have no scale there.
+_STILL = 0.01
 # The model that prediction intervals belong to, among those compared.
 MULTI_FIDELITY = "multi-fidelity"
 
@@ -58,7 +61,8 @@ class ChannelError:
     rmse, maximum
         In the channel's unit.
     nrmse
-        RMSE divided by the standard deviation of the recorded signal; infinite for a constant.
+        RMSE divided by the standard deviation of the recorded signal; infinite for a constant,
+        NaN where the signal hardly moves, see `unless_still`.
     """
 
     rmse: float
@@ -66,16 +70,38 @@ class ChannelError:
     maximum: float
 
     @classmethod
-    def of(cls, simulated: Array, recorded: Array) -> ChannelError:
-        """Compare samples at the same times."""
-        difference, size = simulated - recorded, spread(recorded)
-        rmse = float(np.sqrt(np.mean(difference**2)))
+    def of(cls, simulated: Array, recorded: Array, weights: Array | None = None) -> ChannelError:
+        """Compare samples at the same times; `weights` as of `weights_over_time`."""
+        difference, size = simulated - recorded, spread(recorded, weights)
+        rmse = float(np.sqrt(mean_over(difference**2, weights)))
         return cls(rmse, rmse / size if size else float("inf"), float(np.abs(difference).max()))
 
+    def unless_still(self, recorded: Array, usual: float) -> ChannelError:
+        """The same without an NRMSE where the record moves by less than 1 % of what is usual.
 
-def spread(values: Array) -> float:
+        Parameters
+        ----------
+        recorded
+            The recorded signal.
+        usual
+            Its standard deviation over the training runs; 0 where that is not known.
+        """
+        still = spread(recorded) < _STILL * usual
+        return replace(self, nrmse=float("nan")) if still else self
+
+
+def training_spreads(model: DFSM) -> dict[str, float]:
+    """Standard deviation over the training runs of states and outputs, by name, where known."""
+    names = model.signals.names("states")
+    std = np.asarray(model.region.std)[model.signals.state_columns]
+    outputs = {row["name"]: row["std"] for row in model.provenance.record.get("rows", ())}
+    known = {n: float(outputs[n]) for n in model.signals.names("outputs") if n in outputs}
+    return known | dict(zip(names, std.tolist(), strict=True))
+
+
+def spread(values: Array, weights: Array | None = None) -> float:
     """Standard deviation; 0 for a constant, whose samples differ by rounding errors only."""
-    std = float(values.std())
+    std = float(std_over(values, weights))
     return std if std > 1e-12 * np.abs(values).max() else 0.0
 
 
@@ -181,14 +207,34 @@ class Validation:
         return "\n".join(lines) + ">"
 
     def mean_nrmse(self, model: str, channel: str) -> float | None:
-        """Mean NRMSE over the test runs; None if the model did not complete all of them."""
+        """Mean NRMSE over the test runs in which the channel moves; None if it moves in none.
+
+        Also None if the model did not complete all of the runs.
+        """
         return self.mean_error(model, channel, "nrmse")
 
     def mean_error(self, model: str, channel: str, what: str) -> float | None:
         """Mean of one figure of `ChannelError` over the test runs, as `mean_nrmse`."""
         errors = [r.models[model].errors.get(channel) for r in self.runs]
         values = [getattr(e, what) for e in errors if e is not None]
-        return float(np.mean(values)) if len(values) == len(self.runs) else None
+        known = [v for v in values if not np.isnan(v)]
+        return float(np.mean(known)) if known and len(values) == len(self.runs) else None
+
+    def still(self) -> list[str]:
+        """One sentence on channels that hardly move in some runs, and have no NRMSE there."""
+        still: dict[tuple[str, ...], list[str]] = {}
+        for c in self.channels:
+            errors = ([m.errors.get(c.name) for m in r.models.values()] for r in self.runs)
+            at = [any(e is not None and np.isnan(e.nrmse) for e in run) for run in errors]
+            runs = tuple(r.recorded.where for r, rests in zip(self.runs, at, strict=True) if rests)
+            still.setdefault(runs, []).append(f"'{c.name}'")
+        return [
+            f"{', '.join(names)}: less than {_STILL:.0%} of the spread in training in "
+            f"{', '.join(runs[:3])}{', …' if len(runs) > 3 else ''}, so no NRMSE there and none "
+            "in the mean: see the RMSE"
+            for runs, names in still.items()
+            if runs
+        ]
 
     def coverage(self, channel: str) -> list[float] | None:
         """Share of the time inside the prediction intervals per run; None as for `mean_nrmse`."""

@@ -7,20 +7,25 @@ the start of the window. States and outputs are then compared along the model's 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
-from dfsm.data.derivatives import differentiate
+from dfsm.core.units import factor
+from dfsm.data.conversion import converted
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
+from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_path
-from dfsm.models.signals import Azimuth, radians_per_second, with_computed
+from dfsm.models.recorded import Recorded, recorded_states
+from dfsm.models.signals import Azimuth, radians_per_second
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
 from dfsm.validation.intervals import Intervals
 from dfsm.validation.results import (
@@ -31,6 +36,7 @@ from dfsm.validation.results import (
     ModelRun,
     RunComparison,
     Validation,
+    training_spreads,
 )
 
 # Frequency ranges in Hz in which peaks are compared; blade passing is added where a rotor speed
@@ -87,17 +93,28 @@ def validate(
                 f"{', '.join(models)}: give it that name, or leave the intervals out"
             )
         intervals.check(models[MULTI_FIDELITY])
-    runs = [with_computed(r, first.signals.hub_height, first.signals.features) for r in runs]
+    given = list(runs)
+    with hushed():  # the result tells
+        runs = all_completed(given, first.signals)
     if not runs:
         raise DfsmError("no test runs were given, at least one is needed")
     for run in runs:
         run.columns(first.signals.recorded)
-    notes = _leaks(first, runs, intervals)
+    notes = [*converted(given, runs), *_leaks(first, runs, intervals)]
     results = []
     for run in track(runs, "test runs"):
         results.append(_compare(models, run, (start, stop), settings, intervals))
+    stepped = [
+        f"{name} on {r.recorded.name}: {m.simulation.note}"
+        for r in results
+        for name, m in r.models.items()
+        if m.simulation.note
+    ]
+    if stepped:
+        more = f" (and {len(stepped) - 1} more rollouts alike)" if stepped[1:] else ""
+        notes.append(stepped[0] + more)
     channels = (*first.signals.observed, *first.signals.outputs)
-    return Validation(
+    validation = Validation(
         models=dict(models),
         channels=channels,
         runs=tuple(results),
@@ -107,6 +124,7 @@ def validate(
         warnings=tuple(notes),
         intervals=intervals,
     )
+    return replace(validation, warnings=(*notes, *validation.still()))
 
 
 def compared(model: DFSM, nonlinear: DFSM | None = None) -> dict[str, DFSM]:
@@ -134,24 +152,23 @@ def _compare(
 ) -> RunComparison:
     first = next(iter(models.values()))
     s = first.signals
-    rates = differentiate(run, s.specs, s.derivatives)
-    inside = rates.trajectory.window(*window)
-    rows = np.isin(rates.trajectory.time, inside.time)
-    recorded = recorded_states(first, run.window(*window), inside)
+    seen = recorded_states(first, run, window[0])
+    inside = seen.trajectory.window(*window)
+    recorded = recorded_channels(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
+    weights = weights_over_time([recorded.time])
+    usual = training_spreads(first)
     results = {}
     for name, model in models.items():
         simulation = _simulate_warm(model, run, window, settings)
-        states = inside.select(c.name for c in s.observed).values
-        states = np.concatenate([states, latent_path(model, run)[rows]], axis=1)
-        u, w, p = (inside.select(s.names(g)).values for g in _EXOGENOUS)
-        predicted = np.asarray(model.derivative(states, u, w, p))[:, : len(s.observed)]
         errors: dict[str, ChannelError] = {}
         statistics: dict[str, ChannelStatistics] = {}
         band, coverage = None, {}
         if simulation.status is Status.COMPLETED:
             for c in recorded.channels:
-                errors[c.name] = ChannelError.of(simulation.trajectory[c.name], recorded[c.name])
+                rollout, true = simulation.trajectory[c.name], recorded[c.name]
+                error = ChannelError.of(rollout, true, weights)
+                errors[c.name] = error.unless_still(true, usual.get(c.name, 0.0))
             statistics = all_statistics(simulation.trajectory, bands, s.names("outputs"))
             if intervals is not None and name == MULTI_FIDELITY:
                 band = intervals.around(simulation, run)
@@ -161,7 +178,7 @@ def _compare(
             simulation=simulation,
             errors=errors,
             statistics=statistics,
-            derivative_errors=_derivative_errors(first, predicted, rates.derivatives[rows]),
+            derivative_errors=_derivative_errors(model, run, seen, inside.time),
             band=band,
             coverage=coverage,
         )
@@ -185,7 +202,7 @@ def _simulate_warm(
         return simulate(model, run, start=window[0], stop=window[1], settings=settings)
 
 
-def recorded_states(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
+def recorded_channels(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
     """States and outputs to compare with: measured ones as recorded, rates as extracted."""
     channels = (*model.signals.observed, *model.signals.outputs)
     names = [c.name for c in channels]
@@ -200,10 +217,25 @@ def recorded_states(model: DFSM, run: Trajectory, differentiated: Trajectory) ->
     )
 
 
-def _derivative_errors(model: DFSM, predicted: Array, extracted: Array) -> dict[str, float]:
-    rms = np.sqrt(np.mean((predicted - extracted) ** 2, axis=0))
-    spread = np.maximum(extracted.std(axis=0), np.finfo(float).tiny)
-    names = [c.name for c in model.signals.observed]
+def _derivative_errors(
+    model: DFSM, run: Trajectory, seen: Recorded, time: Array
+) -> dict[str, float]:
+    """NRMSE of derivatives along the record: at samples, or over intervals where inputs jump."""
+    s, rows = model.signals, np.isin(seen.trajectory.time, time)
+    if means := seen.mean_rows(rows):
+        inputs, extracted, weights = means
+        x, *exogenous = model.split(inputs)
+    else:
+        inside = seen.trajectory.window(time[0], time[-1])
+        states = inside.select(c.name for c in s.observed).values
+        x = np.concatenate([states, latent_path(model, run)[np.isin(run.time, time)]], axis=1)
+        exogenous = [inside.select(s.names(g)).values for g in _EXOGENOUS]
+        extracted = seen.found.derivatives[rows]
+        weights = weights_over_time([inside.time])
+    predicted = np.asarray(model.derivative(x, *exogenous))[:, : len(s.observed)]
+    rms = np.sqrt(mean_over((predicted - extracted) ** 2, weights))
+    spread = np.maximum(std_over(extracted, weights), np.finfo(float).tiny)
+    names = [c.name for c in s.observed]
     return dict(zip(names, (rms / spread).tolist(), strict=True))
 
 
@@ -214,11 +246,12 @@ def frequency_bands(model: DFSM, recorded: Trajectory) -> tuple[Band, ...]:
     """
     azimuth = model.signals.azimuth
     if azimuth is None:
-        speeds = [c.name for c in model.signals.states if c.unit == "rpm"]
+        speeds = [c.name for c in model.signals.states if factor(c.unit, "rpm") == 1]
         azimuth = Azimuth(speed=speeds[0]) if speeds else None
     if azimuth is None:
         return PLATFORM, WAVE, LOW
-    omega = recorded[azimuth.speed].mean() * radians_per_second(recorded.channel(azimuth.speed))
+    speed = mean_over(recorded[azimuth.speed], weights_over_time([recorded.time]))
+    omega = float(speed) * radians_per_second(recorded.channel(azimuth.speed))
     passing = azimuth.blades * omega / (2 * np.pi)
     return PLATFORM, WAVE, Band(f"{azimuth.blades}P", 0.8 * passing, 1.2 * passing), LOW
 
@@ -228,8 +261,9 @@ def all_statistics(
 ) -> dict[str, ChannelStatistics]:
     """Statistics of all channels of a run; damage-equivalent loads of those named in `loads`."""
     if run.time_step is None:
-        # Spectra need an equidistant mesh; the median step keeps what the samples resolve.
-        step = float(np.median(np.diff(run.time)))
+        # Spectra need an equidistant mesh; the median step keeps what the samples resolve, unless
+        # most of them stand for next to no time.
+        step = max(float(np.median(np.diff(run.time))), run.duration / (len(run) - 1))
         run = run.resample(np.arange(run.time[0], run.time[-1], step))
     return {c.name: _statistics(run, c.name, bands, c.name in loads) for c in run.channels}
 

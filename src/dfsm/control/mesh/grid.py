@@ -17,12 +17,16 @@ from dfsm.control.mesh.schemes import Kind, Scheme, lagrange, scheme_of
 from dfsm.core.types import Array, IntArray
 from dfsm.errors import DfsmError
 
-# Gauss points per interval at which the equations are checked between the nodes.
-_CHECKED = 6
+# Between the nodes the equations are checked at this many Gauss points per panel, and at about this
+# many over the horizon: a coarse mesh must not miss what happens inside its intervals.
+_CHECKED, _DENSE = 6, 2000
 # An interval is cut into at most this many pieces at once.
 _CUTS = 4
 # Cut for a little less error than asked, or most intervals would need one more round.
 _MARGIN = 0.5
+# Up to this many knots inside an interval become edges at once; those within this share of its
+# length from an edge wait until it is shorter.
+_KNOTS, _BESIDE = 8, 0.02
 
 
 class Matrix(NamedTuple):
@@ -134,9 +138,14 @@ class Grid:
 
     @cached_property
     def checked(self) -> tuple[Array, Array]:
-        """Points θ at which equations are checked in each interval, and quadrature weights."""
+        """Points θ at which equations are checked in each interval, and quadrature weights.
+
+        Gauss points on equal panels, more of them where intervals are few.
+        """
         nodes, weights = np.polynomial.legendre.leggauss(_CHECKED)
-        return (nodes + 1) / 2, weights / 2
+        panels = max(1, round(_DENSE / (_CHECKED * self.intervals)))
+        theta = (np.arange(panels)[:, None] + (nodes + 1) / 2) / panels
+        return theta.ravel(), np.tile(weights / 2 / panels, panels)
 
     def at_checked(self, X: Array, F: Array, U: Array) -> tuple[Array, Array, Array, Array]:
         """States, their slopes with τ, and controls between the nodes.
@@ -165,25 +174,45 @@ class Grid:
             self.scheme.control_basis(theta) @ U[self.local],
         )
 
-    def refined(self, errors: Array, tolerance: float) -> Grid:
+    def refined(self, errors: Array, tolerance: float, knots: Array | None = None) -> Grid:
         """Cut the intervals whose error is above the tolerance.
 
         Parameters
         ----------
         errors
-            Relative local error of every interval.
+            Relative error of every interval.
         tolerance
             Of the same.
+        knots
+            Normalised times, increasing, at which something has a kink: cuts are made there first.
         """
         order = self.scheme.order + 1
         with np.errstate(divide="ignore"):
             wanted = (np.maximum(errors, 1e-300) / (_MARGIN * tolerance)) ** (1 / order)
         pieces = np.where(errors > tolerance, np.clip(np.ceil(wanted), 2, _CUTS), 1).astype(int)
+        knots = np.empty(0) if knots is None else knots
         parts = [
-            left + (right - left) * np.arange(n) / n
+            np.append(left, _cuts(left, right, n, knots)) if n > 1 else [left]
             for left, right, n in zip(self.edges[:-1], self.edges[1:], pieces, strict=True)
         ]
         return Grid(self.kind, self.degree, np.append(np.concatenate(parts), self.edges[-1]))
+
+    def finer(self, pieces: int) -> Grid:
+        """Cut every interval into equal pieces."""
+        inside = np.arange(pieces) / pieces
+        edges = (self.edges[:-1, None] + self.lengths[:, None] * inside).ravel()
+        return Grid(self.kind, self.degree, np.append(edges, self.edges[-1]))
+
+
+def _cuts(left: float, right: float, pieces: int, knots: Array) -> Array:
+    """Where to cut an interval: at its knots, at those nearest to equal pieces, or equally."""
+    equal = left + (right - left) * np.arange(1, pieces) / pieces
+    margin = _BESIDE * (right - left)
+    first, last = np.searchsorted(knots, (left + margin, right - margin))
+    inside = knots[first:last]
+    if len(inside) <= _KNOTS:
+        return inside if len(inside) else equal
+    return np.unique(inside[np.abs(inside - equal[:, None]).argmin(axis=1)])
 
 
 def grid_of(kind: Kind, degree: int, mesh: int | Sequence[float]) -> Grid:

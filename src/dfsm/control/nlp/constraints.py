@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def named(parts: Sequence[Part]) -> list[Rows]:
     """Names of the rows of all parts, counted from the first of all."""
     rows, first = [], 0
     for part in parts:
-        rows += [Rows(r.name, r.index + first, r.times) for r in part.rows]
+        rows += [replace(r, index=r.index + first) for r in part.rows]
         first += len(part.low)
     return rows
 
@@ -205,7 +205,8 @@ def rates(layout: Layout, scale: Array) -> list[Part]:
     for name, (below, above) in problem.rates.items():
         i = problem.plant.names("controls").index(name)
         low, high = level(below, name, middle, -np.inf), level(above, name, middle, np.inf)
-        names = [Rows(f"rate of {name}", row, middle)]
+        span = layout.start.stop if layout.free_time else problem.last_time
+        names = [Rows(f"rate of {name}", row, middle, gaps * (span - problem.start))]
         for s in range(layout.scenarios):
             columns = u[s, nodes, i]
             step = [entries(row, columns[1:], 1.0), entries(row, columns[:-1], -1.0)]

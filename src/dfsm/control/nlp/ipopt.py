@@ -27,9 +27,15 @@ _SOLVED = ("Solve_Succeeded", "Feasible_Point_Found")
 _ACCEPTABLE = ("Solved_To_Acceptable_Level",)
 _STALLED = ("Search_Direction_Becomes_Too_Small",)
 _INFEASIBLE = ("Infeasible_Problem_Detected", "Not_Enough_Degrees_Of_Freedom")
-_LIMIT = ("Maximum_Iterations_Exceeded", "Maximum_CpuTime_Exceeded", "Maximum_WallTime_Exceeded")
+_LIMIT = ("Maximum_Iterations_Exceeded",)
+_TIME = ("Maximum_CpuTime_Exceeded", "Maximum_WallTime_Exceeded")
+_UNBOUNDED = ("Diverging_Iterates",)
 _STOPPED = ("User_Requested_Stop",)
 _NOT_FINITE = ("Invalid_Number_Detected",)
+# Endings after which the best iterate is worth more than the last one.
+_BEST = ("interrupted", "limit", "time", "not finite", "failed")
+# Scaled variables beyond this run away.
+_DIVERGED = 1e12
 
 
 @dataclass(frozen=True)
@@ -43,8 +49,8 @@ class Outcome:
     multipliers, bound_multipliers
         Of scaled constraints and of scaled variables.
     ending
-        ``"solved"``, ``"acceptable"``, ``"stalled"``, ``"infeasible"``, ``"limit"``,
-        ``"interrupted"``, ``"not finite"`` or ``"failed"``: what the solver says.
+        ``"solved"``, ``"acceptable"``, ``"stalled"``, ``"infeasible"``, ``"limit"``, ``"time"``,
+        ``"unbounded"``, ``"interrupted"``, ``"not finite"`` or ``"failed"``: what the solver says.
     optimality
         How well the conditions hold at `z`: what is measured.
     iterations
@@ -74,11 +80,17 @@ class SolverSettings:
         Most steps.
     warm
         The start is near a solution: stay close to it, bounds included.
+    adaptive
+        Let the barrier of a linear-quadratic program adapt: fewer iterations, but no guarantee.
+    until
+        When to stop, as `time.perf_counter` counts; None for no limit.
     """
 
     tolerance: float = 1e-8
     iterations: int = 500
     warm: bool = False
+    adaptive: bool = True
+    until: float | None = None
 
 
 def solve_nlp(
@@ -125,17 +137,16 @@ def solve_nlp(
     stats = solver.stats()
     ending = _ending(stats["return_status"])
     z, lam_g, lam_x = (np.array(last[k]).ravel() for k in ("x", "lam_g", "lam_x"))
-    if ending in ("interrupted", "limit", "not finite", "failed") and watch.best is not None:
-        z, lam_g, lam_x = watch.best
-    return Outcome(
-        z,
-        lam_g,
-        lam_x,
-        ending,
-        optimality(program, z, lam_g, lam_x),
-        int(stats["iter_count"]),
-        clock.perf_counter() - begin,
-    )
+    point = z, lam_g, lam_x
+    measured = optimality(program, *point)
+    if ending == "failed" and measured.held(settings.tolerance):
+        # It gives up, too, where rounding lets no step improve a point that is a solution.
+        ending = "stalled"
+    if ending in _BEST and watch.best is not None:
+        point = watch.best
+        measured = optimality(program, *point)
+    seconds = clock.perf_counter() - begin
+    return Outcome(*point, ending, measured, int(stats["iter_count"]), seconds)
 
 
 def _require_freedom(program: Program) -> None:
@@ -156,6 +167,8 @@ def _ending(word: str) -> str:
         ("stalled", _STALLED),
         ("infeasible", _INFEASIBLE),
         ("limit", _LIMIT),
+        ("time", _TIME),
+        ("unbounded", _UNBOUNDED),
         ("interrupted", _STOPPED),
         ("not finite", _NOT_FINITE),
     ):
@@ -178,8 +191,13 @@ def _ipopt(program: Program, settings: SolverSettings, multipliers: bool) -> dic
         "ipopt.max_iter": settings.iterations,
         # Bounds are met exactly: users rely on them, and a square root on x ≥ 0.
         "ipopt.bound_relax_factor": 0.0,
-        "ipopt.mu_strategy": "adaptive" if program.linear_quadratic else "monotone",
+        "ipopt.diverging_iterates_tol": _DIVERGED,
+        "ipopt.mu_strategy": (
+            "adaptive" if program.linear_quadratic and settings.adaptive else "monotone"
+        ),
     }
+    if settings.until is not None:
+        chosen["ipopt.max_wall_time"] = max(settings.until - clock.perf_counter(), 1e-3)
     if settings.warm:
         chosen |= {
             "ipopt.mu_init": 1e-5,

@@ -18,6 +18,9 @@ from dfsm.errors import DfsmError
 
 # Limits from here on mean that there is none.
 _NONE = 1e15
+# A size that comes from values on a coarser mesh is no smaller than this share of the size there: a
+# state that stayed at rest is known to the tolerance only.
+_LEAST_OF_BEFORE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,15 +209,17 @@ class Layout:
         x, u, q = self.columns
         scale = np.ones(self.count)
         plant = self.problem.plant
-        for group, columns, values, nodes in (
-            ("states", x, self.start.X, self.state_nodes),
-            ("controls", u, self.start.U, self.control_nodes),
+        before = self.start.sizes or (np.zeros(x.shape[2]), np.zeros(u.shape[2]))
+        for group, columns, values, nodes, sizes in (
+            ("states", x, self.start.X, self.state_nodes, before[0]),
+            ("controls", u, self.start.U, self.control_nodes, before[1]),
         ):
             for i, name in enumerate(plant.names(group)):
                 at = columns[:, nodes, i]
                 # The ends may be fixed: look at the whole course.
                 half = (high[at].max() - low[at].min()) / 2
-                scale[at] = self._size(name, half, float(np.abs(values[..., i]).max()))
+                most = float(np.abs(values[..., i]).max())
+                scale[at] = self._size(name, half, max(most, _LEAST_OF_BEFORE * sizes[i]))
         for at, name, value in zip(q, self.problem.free_parameters, self.start.p, strict=False):
             scale[at] = self._size(name, float(high[at] - low[at]) / 2, abs(value))
         if self.free_time:
@@ -231,6 +236,11 @@ class Layout:
             if spread > 0:
                 return spread
         return guess if guess > 0 else 1.0
+
+    def sizes(self, scale: Array) -> tuple[Array, Array]:
+        """Of states and controls, ``(n,)``, from those of all variables."""
+        x, u, _ = self.columns
+        return scale[x[0, 0]], scale[u[0, 0]]
 
     def names(self) -> list[Rows]:
         """What every variable is called, and when it is."""

@@ -59,11 +59,15 @@ class Rows:
         Where they stand, shape ``(count,)``.
     times
         Time of each in s, shape ``(count,)``, NaN where there is none.
+    per
+        What a value is divided by to be in the unit that the name stands for, shape ``(count,)``;
+        None for 1.
     """
 
     name: str
     index: IntArray
     times: Array
+    per: Array | None = None
 
 
 class Program:

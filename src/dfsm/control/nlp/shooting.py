@@ -17,9 +17,11 @@ import numpy as np
 from dfsm.control.guess import Start
 from dfsm.control.mesh.grid import Grid
 from dfsm.control.nlp import constraints
+from dfsm.control.nlp.estimate import Estimate
+from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.program import Block, Program, Rows
-from dfsm.control.nlp.shot import Shot, quoted
+from dfsm.control.nlp.shot import Shot, check_seconds, quoted
 from dfsm.control.nlp.terms import Functions, Term, common_of, functions_of
 from dfsm.control.nlp.transcription import node_data
 from dfsm.control.problem import OptimalControlProblem
@@ -61,6 +63,8 @@ class MultipleShooting(_OneMesh):
         Of the scaled optimality conditions.
     most_iterations
         Of the solver.
+    most_seconds
+        For the solve, None for no limit.
     """
 
     segments: int = 20
@@ -69,6 +73,7 @@ class MultipleShooting(_OneMesh):
     stay_inside: bool = False
     tolerance: float = 1e-8
     most_iterations: int = 500
+    most_seconds: float | None = None
 
     def __post_init__(self) -> None:
         _check(self)
@@ -93,7 +98,7 @@ class SingleShooting(_OneMesh):
         ends.
     steps
         RK4 steps in every piece.
-    stay_inside, tolerance, most_iterations
+    stay_inside, tolerance, most_iterations, most_seconds
         See `MultipleShooting`.
     """
 
@@ -102,6 +107,7 @@ class SingleShooting(_OneMesh):
     stay_inside: bool = False
     tolerance: float = 1e-8
     most_iterations: int = 500
+    most_seconds: float | None = None
 
     def __post_init__(self) -> None:
         _check(self)
@@ -124,6 +130,7 @@ def _check(method: MultipleShooting | SingleShooting) -> None:
     for name in ("segments", "pieces", "steps", "most_iterations"):
         require(getattr(method, name) >= 1, name, getattr(method, name), "at least 1")
     require(method.tolerance > 0, "tolerance", method.tolerance, "more than 0")
+    check_seconds(method.most_seconds)
 
 
 class Shooting(Shot):
@@ -168,10 +175,10 @@ class Shooting(Shot):
         start.X[:, at] = inner.reshape(*shape, -1, nx)
         return start
 
-    def errors(self, start: Start) -> Array:
-        """No estimate: the replay tells how good the steps are."""
-        del start
-        return np.full(self.method.segments, np.nan)
+    def estimate(self, outcome: Outcome, start: Start) -> Estimate:
+        """None: the replay tells how good the steps are."""
+        del outcome, start
+        return Estimate.unknown(self.method.segments)
 
     def costates(self, multipliers: Array) -> tuple[Trajectory, ...]:
         """∂J/∂ξ at the ends of the segments, per scenario."""

@@ -12,10 +12,13 @@ import numpy as np
 
 from dfsm.control.guess import Start
 from dfsm.control.mesh.grid import Grid
+from dfsm.control.nlp.estimate import Estimate
+from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.terms import Functions
 from dfsm.control.problem import OptimalControlProblem
+from dfsm.core.settings import require
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
 
@@ -47,8 +50,8 @@ class Shot(Protocol):
         ...
 
     @abstractmethod
-    def errors(self, start: Start) -> Array:
-        """Relative local error of every interval, NaN where there is no estimate."""
+    def estimate(self, outcome: Outcome, start: Start) -> Estimate:
+        """Errors between the nodes, NaN where nothing estimates them."""
         ...
 
     @abstractmethod
@@ -84,8 +87,10 @@ class Method(Protocol):
         Keep to the training range of a surrogate.
     tolerance, most_iterations
         Of the solver.
+    most_seconds
+        For all meshes together, None for no limit.
     refine, most_refinements
-        Local error to which meshes are refined, None where they are not, and how often.
+        Error to which meshes are refined, None where they are not, and how often.
     """
 
     @property
@@ -94,6 +99,8 @@ class Method(Protocol):
     def tolerance(self) -> float: ...  # noqa: D102
     @property
     def most_iterations(self) -> int: ...  # noqa: D102
+    @property
+    def most_seconds(self) -> float | None: ...  # noqa: D102
     @property
     def refine(self) -> float | None: ...  # noqa: D102
     @property
@@ -111,3 +118,8 @@ class Method(Protocol):
 def quoted(sizes: dict[str, int]) -> list[str]:
     """Names of constraints in quotes, as often as they have values."""
     return [f"'{name}'" for name, count in sizes.items() for _ in range(count)]
+
+
+def check_seconds(limit: float | None) -> None:
+    """Refuse a time limit that is none."""
+    require(limit is None or limit > 0, "most_seconds", limit, "more than 0, or None")

@@ -116,7 +116,7 @@ def _follow(jaxpr: Any, masks: Masks) -> list[BoolArray]:
 def _through(equation: Any, enters: Masks) -> Masks:
     """Masks of the outputs of one operation."""
     name, options, outputs = equation.primitive.name, equation.params, equation.outvars
-    inner = _inner(equation)
+    inner = inner_code(equation)
     if inner is not None:
         return _follow(inner, enters)
     if name in _ELEMENTWISE:
@@ -138,7 +138,7 @@ def _either(masks: Masks) -> BoolArray:
     return total
 
 
-def _inner(equation: Any) -> Any:
+def inner_code(equation: Any) -> Any:
     """Code of a call, if its inputs and outputs are those of the equation; else None."""
     if equation.primitive.name not in _CALLS:
         return None

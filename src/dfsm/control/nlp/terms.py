@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.control.names import End, Signals
@@ -113,12 +114,14 @@ class Functions:
 
     Attributes
     ----------
-    slopes, node, ends
-        Terms with the outputs ẋ; [T L, T ẋ, path constraints]; [M, boundary constraints].
+    node, ends
+        Terms with the outputs [T L, T ẋ, path constraints]; [M, boundary constraints].
     segments
         Terms of shooting, by what a segment consists of.
     path_sizes, boundary_sizes
         Number of values of every constraint by name; bounded outputs are path constraints too.
+    path_jumps
+        Which values of the path constraints depend on controls, shape ``(value,)``.
     """
 
     def __init__(self, problem: OptimalControlProblem) -> None:
@@ -133,10 +136,10 @@ class Functions:
         self._path = {n: c[0] for n, c in problem.constraints.items()}
         self._boundary = {n: c[0] for n, c in problem.boundary.items()}
         self._outputs = tuple(n for n in self.plant.names("outputs") if n in problem.bounds)
-        self.path_sizes, self.boundary_sizes = _sizes(self, problem)
+        _check_model(self, problem)
+        self.path_sizes, self.boundary_sizes, self.path_jumps = _sizes(self, problem)
         self.node = _joined(self._node_cost, self._node_constraints)
         self.ends = _joined(self._ends_cost, self._ends_constraints)
-        self.slopes = Term(self._slopes_row)
         self.segments: dict[tuple[int, int], Term] = {}
 
     def unpack(self, q: jax.Array, common: Any) -> tuple[jax.Array, jax.Array]:
@@ -180,9 +183,6 @@ class Functions:
     def _node_constraints(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
         s, vectors, duration = self.signals(z, data, common)
         return jnp.concatenate([self.plant.derivative(*vectors) * duration, self.path(s)])
-
-    def _slopes_row(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
-        return self.plant.derivative(*self.signals(z, data, common)[1])
 
     def end_pair(self, z: jax.Array, common: Any) -> tuple[End, End]:
         """Named signals of both ends."""
@@ -269,10 +269,32 @@ def scalar(function: Callable[..., Any], what: str, *arguments: Any) -> jax.Arra
     return value
 
 
+def _check_model(functions: Functions, problem: OptimalControlProblem) -> None:
+    """Refuse a model whose functions return other numbers of values than it has channels."""
+    plant = functions.plant
+    arguments = [jnp.ones(len(plant.names(g))) for g in ("states", "controls", "disturbances")]
+    arguments.append(jnp.ones(len(plant.names("parameters"))))
+    for function, group, what in (
+        (plant.derivative, "states", "the model's f"),
+        (plant.output, "outputs", "the model's g"),
+    ):
+        count = len(plant.names(group))
+        label = f"{problem.name}: {what}"
+        shape = jax.eval_shape(lambda *a, f=function, w=label: vector(f, w, *a), *arguments).shape
+        if shape != (count,):
+            raise DfsmError(
+                f"{label} returns {shape[0]} values for the {count} {group} "
+                f"{', '.join(plant.names(group))}: return one number for each"
+            )
+
+
 def _sizes(
     functions: Functions, problem: OptimalControlProblem
-) -> tuple[dict[str, int], dict[str, int]]:
-    """Number of values of every path and boundary constraint; refuse those without an effect."""
+) -> tuple[dict[str, int], dict[str, int], NDArray[np.bool_]]:
+    """Number of values of every path and boundary constraint; refuse those without an effect.
+
+    And which values of the path constraints depend on controls.
+    """
     common = common_of(problem)
     extra = len(problem.free_parameters) + (problem.free_time is not None)
     data = {"tau": jnp.array(0.5), "scenario": 0}
@@ -305,7 +327,13 @@ def _sizes(
         jax.eval_shape(lambda z: functions.integrand(functions.signals(z, data, common)[0]), z)
     if problem.final_cost:
         jax.eval_shape(lambda z: functions.final_cost(z, common), ends)
-    return path, boundary
+
+    def by_controls(u: jax.Array) -> jax.Array:
+        x, q = jnp.ones(functions.nx), jnp.ones(extra)
+        return functions.path(functions.signals(jnp.concatenate([x, u, q]), data, common)[0])
+
+    (jumps,) = dependent(by_controls, jnp.ones(functions.nu)) if path else (np.zeros(0, bool),)
+    return path, boundary, jumps
 
 
 def common_of(problem: OptimalControlProblem) -> dict[str, Array]:

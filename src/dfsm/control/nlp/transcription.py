@@ -18,9 +18,11 @@ from dfsm.control.guess import Start
 from dfsm.control.mesh.grid import Grid, grid_of
 from dfsm.control.mesh.schemes import Kind
 from dfsm.control.nlp import constraints
+from dfsm.control.nlp.estimate import Estimate, estimate_of
+from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.program import Block, Program
-from dfsm.control.nlp.shot import Shot, quoted
+from dfsm.control.nlp.shot import Shot, check_seconds, quoted
 from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.settings import require, settings_class
@@ -42,9 +44,8 @@ class DirectTranscription:
     mesh
         Number of equal intervals, or edges as fractions of the horizon, from 0 to 1.
     refine
-        Cut intervals until the relative local error of every one is below this; None keeps the
-        mesh as it is. The error is ∫ |ẋ − f| dt over an interval, relative to the largest value
-        of each state (Betts 2010, Sec. 4.7).
+        Cut intervals until the errors of dynamics, cost and constraints between the nodes are all
+        below this, see `Solution.errors`; None keeps the mesh as it is.
     most_refinements
         Meshes tried after the first.
     stay_inside
@@ -54,6 +55,8 @@ class DirectTranscription:
         Of the scaled optimality conditions.
     most_iterations
         Of the solver, on each mesh.
+    most_seconds
+        For all meshes together, None for no limit.
     """
 
     scheme: Kind = "hermite_simpson"
@@ -64,6 +67,7 @@ class DirectTranscription:
     stay_inside: bool = False
     tolerance: float = 1e-8
     most_iterations: int = 500
+    most_seconds: float | None = None
 
     def __post_init__(self) -> None:
         require(1 <= self.degree <= 12, "degree", self.degree, "1 to 12")
@@ -71,6 +75,7 @@ class DirectTranscription:
         require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
         require(self.most_iterations >= 1, "most_iterations", self.most_iterations, "at least 1")
         require(self.most_refinements >= 0, "most_refinements", self.most_refinements, "0 or more")
+        check_seconds(self.most_seconds)
         self.grid()
 
     def grid(self) -> Grid:
@@ -121,6 +126,7 @@ class Transcription(Shot):
             constraints.boundary(layout, end_outputs),
             *constraints.rates(layout, scale),
         ]
+        self._first_path = len(parts[0].low)
         weights = self.problem.scenario_weights
         c = np.zeros((layout.scenarios, layout.nodes, outputs))
         c[..., 0] = weights[:, None] * self.grid.weights
@@ -160,6 +166,10 @@ class Transcription(Shot):
         Radau's belong to its collocation points (Garg et al. 2011), the others' to the middles of
         the intervals. States that are known beforehand have none.
         """
+        return self.layout.costates(*self.costate_values(multipliers))
+
+    def costate_values(self, multipliers: Array) -> tuple[Array, Array]:
+        """Normalised times, and `costates` at these, ``(scenario, time, solved state)``."""
         layout, grid = self.layout, self.grid
         defects, states = len(grid.scheme.D), len(layout.solved)
         shape = (layout.scenarios, grid.intervals, defects, states)
@@ -169,43 +179,62 @@ class Transcription(Shot):
             tau = grid.tau[1:]
         else:
             values, tau = values[:, :, -1:], grid.edges[:-1] + grid.lengths / 2
-        values = values.reshape(layout.scenarios, -1, states)
-        return layout.costates(tau, values)
+        return tau, values.reshape(layout.scenarios, -1, states)
 
-    def slopes(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
-        """State derivatives with normalised time, for states and controls at the same times.
+    def at(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
+        """Outputs of the nodes' term anywhere: [T L, T ẋ, path constraints].
 
         Parameters
         ----------
         X, U
-            Shape ``(scenario, time, n)``.
+            States and controls at the same times, shape ``(scenario, time, n)``.
         start
             Holds the free parameters and the last time.
         tau
-            Shape ``(time,)``.
+            Normalised times, shape ``(time,)``.
+
+        Returns
+        -------
+        ndarray
+            Shape ``(scenario, time, output)``.
         """
+        local, data = self._local(X, U, start, tau)
+        values = self.functions.node.values(local, data, self.common)
+        return values.reshape(*X.shape[:2], -1)
+
+    def in_controls(
+        self, X: Array, U: Array, start: Start, tau: Array, weights: Array
+    ) -> tuple[Array, Array]:
+        """First and second derivatives of weighted outputs with every control, see `at`.
+
+        `weights` has the shape of what `at` returns, what comes back that of `U`.
+        """
+        local, data = self._local(X, U, start, tau)
+        node, common = self.functions.node, self.common
+        flat = weights.reshape(len(local), -1)
+        own = slice(X.shape[2], X.shape[2] + U.shape[2])
+        slope = np.einsum("ro,roc->rc", flat, node.jacobian(local, data, common)[:, :, own])
+        second = node.hessian(local, data, common, flat)
+        curve = np.diagonal(second, axis1=1, axis2=2)[:, own]
+        return slope.reshape(U.shape), curve.reshape(U.shape)
+
+    def _local(self, X: Array, U: Array, start: Start, tau: Array) -> tuple[Array, dict[str, Any]]:
+        """Local vectors and data of the nodes' term, row by row."""
         time = self.problem.start + tau * (start.stop - self.problem.start)
         shared = [*start.p, *([start.stop] if self.layout.free_time else [])]
         rows = (*X.shape[:2], len(shared))
         local = np.concatenate([X, U, np.broadcast_to(shared, rows)], axis=2)
-        data = node_data(self.problem, tau, time)
-        flat = local.reshape(-1, local.shape[2])
-        slopes = self.functions.slopes.values(flat, data, self.common)
-        return slopes.reshape(X.shape) * (start.stop - self.problem.start)
+        return local.reshape(-1, local.shape[2]), node_data(self.problem, tau, time)
 
-    def errors(self, start: Start) -> Array:
-        """Relative local error of every interval, the worst of all states and scenarios."""
-        grid, count = self.grid, self.layout.scenarios
-        F = self.slopes(start.X, start.U, start, grid.tau)
-        seen = [grid.at_checked(*a) for a in zip(start.X, F, start.U, strict=True)]
-        tau = seen[0][0].ravel()
-        X, dX, U = (np.stack([s[k] for s in seen]) for k in (1, 2, 3))
-        f = self.slopes(
-            X.reshape(count, len(tau), -1), U.reshape(count, len(tau), -1), start, tau
-        ).reshape(X.shape)
-        missing = np.einsum("g,skgx->skx", grid.checked[1], np.abs(dX - f)) * grid.lengths[:, None]
-        size = np.maximum(np.abs(start.X).max(axis=(0, 1)), 1e-3 * self._sizes())
-        return (missing / size)[..., self.layout.solved].max(axis=(0, 2))
+    def estimate(self, outcome: Outcome, start: Start) -> Estimate:
+        """Errors between the nodes, see `nlp.estimate`."""
+        return estimate_of(self, outcome, start)
+
+    def path_rows(self) -> IntArray:
+        """Constraints that are path constraints, shape ``(scenario, control node, value)``."""
+        width = sum(self.functions.path_sizes.values())
+        shape = (self.layout.scenarios, len(self.layout.control_nodes), width)
+        return self._first_path + np.arange(np.prod(shape)).reshape(shape)
 
     def row_nodes(self) -> IntArray:
         """All of them."""
@@ -216,9 +245,6 @@ class Transcription(Shot):
         states = self.functions.plant.names("states")
         slopes = [f"the derivative of '{n}'" for n in states]
         return ["the cost", *slopes, *quoted(self.functions.path_sizes)]
-
-    def _sizes(self) -> Array:
-        return self.program.scale[self.layout.columns[0][0, 0]]
 
 
 def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Any]:

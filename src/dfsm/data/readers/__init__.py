@@ -12,6 +12,7 @@ from pathlib import Path
 from dfsm.core.files import existing_file
 from dfsm.core.progress import track
 from dfsm.data.info import ChannelInfo, RunInfo, describe, gap_warning
+from dfsm.data.readers.hawc2 import is_hawc2, read_hawc2
 from dfsm.data.readers.openfast import read_openfast
 from dfsm.data.readers.tables import read_table, write_table
 from dfsm.data.readers.turbsim import read_turbsim
@@ -39,22 +40,25 @@ __all__ = [
     "write_table",
 ]
 
-OPENFAST = {".outb", ".out"}
-TABLES = {".csv", ".txt", ".tsv", ".parquet", ".pq", ".mat"}
+OPENFAST = {".outb", ".out", ".dbg", ".dbg2", ".dbg3"}
+TABLES = {".csv", ".txt", ".tsv", ".parquet", ".pq", ".mat", ".hdf5", ".h5"}
 # How files begin that are recognised under any name.
 SIGNATURES = {b"PAR1": read_table, b"MATLAB": read_table, b"\x89HDF": read_table} | {
     bytes([n, 0]): read_openfast for n in (1, 2, 3, 4)
 }
 
 
-def read(path: str | Path) -> Trajectory:
+def read(path: str | Path, step: float | None = None) -> Trajectory:
     """Read one run, whatever kind of file it is.
 
     Parameters
     ----------
     path
-        OpenFAST `.outb` or `.out`, `.csv` (`.txt`, `.tsv`), `.parquet` or `.mat`; under another
-        name, binary files are recognised by their first bytes.
+        OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, HAWC2 `.sel` or `.hdf5`, `.csv` (`.txt`,
+        `.tsv`), `.parquet` or `.mat`; under another name, binary files are recognised by their
+        first bytes.
+    step
+        Interval between samples in s for tables that hold no time.
 
     Returns
     -------
@@ -70,20 +74,24 @@ def read(path: str | Path) -> Trajectory:
     suffix = path.suffix.lower()
     if suffix in OPENFAST:
         return read_openfast(path)
+    if is_hawc2(path):
+        return read_hawc2(path)
     if suffix in TABLES:
-        return read_table(path)
+        return read_table(path, step)
     with path.open("rb") as stream:
         start = stream.read(8)
     for signature, reader in SIGNATURES.items():
         if start.startswith(signature):
-            return reader(path)
+            return read_table(path, step) if reader is read_table else reader(path)
     raise DfsmError(
         f"{path}: '{path.suffix}' is no known kind of file; expected .outb, .out, .csv, .parquet "
         "or .mat: rename or convert it"
     )
 
 
-def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[Trajectory]:
+def read_all(
+    patterns: Iterable[str | Path], base: Path | None = None, step: float | None = None
+) -> list[Trajectory]:
     """Read every file that the patterns name, each once, in the order named.
 
     Parameters
@@ -92,6 +100,8 @@ def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[T
         File names or glob patterns (``runs/*.outb``, ``**`` for any depth); one alone will do.
     base
         Folder that relative patterns start from; default the working folder.
+    step
+        Interval between samples in s for tables that hold no time.
 
     Returns
     -------
@@ -109,7 +119,7 @@ def read_all(patterns: Iterable[str | Path], base: Path | None = None) -> list[T
     for pattern in patterns:
         for path in _expand(pattern, base):
             paths.setdefault(path.resolve(), path)
-    return [read(path) for path in track(list(paths.values()), "Reading runs")]
+    return [read(path, step) for path in track(list(paths.values()), "Reading runs")]
 
 
 def with_wall_times(runs: Iterable[Trajectory], path: str | Path) -> list[Trajectory]:

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.data.ends import recorded_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
+from dfsm.numerics.time_mesh import without_rounding
 
 
 def assemble(
@@ -26,8 +28,9 @@ def assemble(
     """Build a trajectory from what a file holds, with every channel name usable once.
 
     Channels that OpenFAST calls `Invalid` are left out. Where a name stands twice, the later
-    channel is left out if its data are the same and called ``Name#2`` if they differ. Each
-    change is told in `Trajectory.notes`.
+    channel is left out if its data are the same and called ``Name#2`` if they differ. Rows at
+    either end that were not recorded are left out. Times that are equidistant but for the rounding
+    of their file are equidistant. Each change is told in `Trajectory.notes`.
 
     Parameters
     ----------
@@ -58,9 +61,14 @@ def assemble(
     keep, named = _name_once(values, channels, valid, told)
     if not keep:
         raise DfsmError(f"{path}: no channel besides time, at least one is needed")
+    values = values[:, keep]
+    if len(values) > 1:
+        rows, lost = recorded_rows(time, values)
+        time, values = without_rounding(time[rows]), values[rows]
+        told += lost
     return Trajectory(
         time,
-        values[:, keep],
+        values,
         tuple(named),
         name=name or path.stem,
         source=str(path),

@@ -18,6 +18,9 @@ TIME_NAMES = ("time", "t")
 # What pandas calls a column that it saved or read without a name, and a name left blank.
 INDEX = re.compile(r"|unnamed: \d+|__index_level_\d+__", re.IGNORECASE)
 SECONDS = ("", "s", "sec", "second", "seconds")
+# Sampling interval in s, or rate in Hz, of a record without a time.
+INTERVAL_NAMES = ("ts", "dt", "t_s", "step", "sampling_time", "sampling_interval")
+RATE_NAMES = ("fs", "f_s", "sampling_rate", "sampling_frequency", "samplerate", "sample_rate")
 
 
 def split_header(text: str) -> tuple[str, str]:
@@ -93,8 +96,48 @@ def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TI
                     "convert it"
                 )
             return i
+    raise no_time(path, channels)
+
+
+def no_time(path: Path, channels: Sequence[Channel]) -> DfsmError:
+    """What to say of a file without a time and without a rate."""
     shown = ", ".join(c.name or "(no name)" for c in channels[:12])
     shown += ", …" if len(channels) > 12 else ""
-    raise DfsmError(
-        f"{path}: no time column, expected one called Time, time or t (in s), found: {shown[:400]}"
+    return DfsmError(
+        f"{path}: no time column, expected one called Time, time or t (in s), found: "
+        f"{shown[:400] or 'nothing'}: add it, or tell the interval of samples at a fixed rate "
+        "(--step of the command, data.step in a configuration, fs, Ts or dt beside the signals)"
     )
+
+
+def rate_step(name: str, value: float) -> float | None:
+    """Sampling interval in s that a number called ``fs``, ``Ts`` or ``dt`` tells; None for others.
+
+    Parameters
+    ----------
+    name
+        As in the file, in any case.
+    value
+        In Hz for a rate, in s for an interval.
+    """
+    if not (np.isfinite(value) and value > 0):
+        return None
+    if name.lower() in INTERVAL_NAMES:
+        return value
+    return 1 / value if name.lower() in RATE_NAMES else None
+
+
+def uniform_times(path: Path, count: int, step: float) -> Array:
+    """Times in s of samples at a fixed interval, from 0, shape ``(count,)``.
+
+    Raises
+    ------
+    DfsmError
+        The interval is no positive number.
+    """
+    if not (np.isfinite(step) and step > 0):
+        raise DfsmError(
+            f"{path}: the interval between samples is {step:g} s, expected a positive number: "
+            "correct it"
+        )
+    return step * np.arange(count)

@@ -1,54 +1,75 @@
-"""MAT files up to v7: loose vectors, or what MATLAB's `ReadFASTbinary` leaves in a workspace."""
+"""MAT files: structs of any depth, matrices, Simulink's output, and what `ReadFASTbinary` leaves.
+
+Names are those of the workspace: ``body.position`` of 6 columns becomes ``body.position_1`` to
+``_6``; arrays of structs count their elements (``bodies_1.position``). Simulink's *Structure With
+Time* is ``time`` and ``signals.values``. A struct that is the only one names nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
-from dfsm.data.readers.columns import TIME_NAMES, kept_columns, time_column
+from dfsm.data.readers.columns import (
+    TIME_NAMES,
+    kept_columns,
+    no_time,
+    rate_step,
+    time_column,
+    uniform_times,
+)
+from dfsm.data.readers.hawc2 import from_gtsdf, is_gtsdf
+from dfsm.data.readers.hdf5 import read_hdf5
+from dfsm.data.readers.mat4 import is_mat4, read_mat4
+from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
 MAT_TIME_NAMES = (*TIME_NAMES, "tout")
 HDF5 = b"\x89HDF\r\n\x1a\n"
+# Columns of a matrix that are worth a channel each; more are pictures and mode shapes.
+_WIDEST = 100
 
 
-def read_mat(path: Path) -> Trajectory:
+def read_mat(path: Path, step: float | None = None) -> Trajectory:
     """Read a run from an existing MAT file, see `dfsm.data.readers.tables.read_table`.
 
     Raises
     ------
     DfsmError
-        v7.3 (HDF5), damaged, or without time and channels.
+        DamagedError, v7.3 (HDF5) without h5py, or without time and channels.
     """
-    from scipy.io import loadmat
-
     with path.open("rb") as stream:
         start = stream.read(520)
     if start.startswith((HDF5, b"MATLAB 7.3")) or start[512:] == HDF5:
-        raise DfsmError(f"{path} is a MAT file of v7.3 (HDF5), up to v7 is read: save with -v7")
-    try:
-        content = loadmat(str(path), simplify_cells=True)
-    except Exception as error:  # SciPy raises a dozen unrelated types on damaged files
-        raise DfsmError(
-            f"{path} is no readable MAT file ({type(error).__name__}: {str(error)[:120]}): "
-            "save it again with -v7"
-        ) from error
-    content = {k: v for k, v in content.items() if not k.startswith("__")}
-    structs = [v for v in content.values() if isinstance(v, Mapping)]
+        content = read_hdf5(path)
+        if is_gtsdf(content):
+            return from_gtsdf(path, content)
+        content = {k: v for k, v in content.items() if not k.startswith("@")}
+    else:
+        try:
+            content = read_mat4(path) if is_mat4(start) else read_mat5(path)
+        except DamagedError as error:
+            raise DfsmError(
+                f"{path} is no readable MAT file ({error}): save it again with -v7"
+            ) from None
+    structs = {n: v for n, v in content.items() if isinstance(v, Mapping)}
     if not _is_run(content) and len(structs) == 1:
-        content = dict(structs[0])
+        ((outer, inside),) = structs.items()
+        content = {**inside, **{n: v for n, v in content.items() if n not in (outer, *inside)}}
     if "Channels" in content:
         return _from_channels(path, content)
-    return _from_vectors(path, content)
+    return _from_variables(path, content, step)
 
 
 def _is_run(content: Mapping[str, Any]) -> bool:
-    return "Channels" in content or any(k.lower() in MAT_TIME_NAMES for k in content)
+    """Whether variables hold a time or `Channels`."""
+    return "Channels" in content or any(n.lower() in MAT_TIME_NAMES for n in content)
 
 
 def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:
@@ -73,23 +94,131 @@ def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:
     return assemble(path, table[:, time], table[:, keep], [channels[i] for i in keep], notes=notes)
 
 
-def _from_vectors(path: Path, content: Mapping[str, Any]) -> Trajectory:
-    vectors: dict[str, np.ndarray] = {}
+def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) -> Trajectory:
+    """Every vector and matrix that is as long as the time."""
+    found = dict(_flat(content, ""))
+    numbers = {
+        n: v for n, v in found.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiub"
+    }
+    time_name = _time_name(numbers)
+    notes: list[str] = []
+    if time_name is None:
+        time, rate = _without_time(path, found, numbers, step)
+        notes.append(f"there is no time: samples every {time[1] - time[0]:g} s, which {rate}")
+    else:
+        time, rate = np.ravel(numbers[time_name]).astype(np.float64), ""
+    columns: list[Array] = []
+    channels: list[Channel] = []
+    for name, value in found.items():
+        if name == time_name or (rate and f"'{name}'" in rate):
+            continue
+        if name.rsplit(".", 1)[-1].lower() in MAT_TIME_NAMES and name in numbers:
+            if _same_times(numbers[name], time):
+                continue
+            notes.append(f"'{name}' left out: it is another time than '{time_name}'")
+            continue
+        table = _along(numbers.get(name), len(time))
+        other = None if time_name is None else _own_time(name, numbers)
+        if table is None or (other is not None and not _same_times(numbers[other], time)):
+            notes.append(f"'{name}' left out: {_why(value, len(time), other)}")
+            continue
+        single = table.shape[1] == 1
+        columns += list(table.T)
+        channels += [Channel(name if single else f"{name}_{i + 1}") for i in range(table.shape[1])]
+    values = np.stack(columns, axis=1) if columns else np.empty((len(time), 0))
+    return assemble(path, time, values, channels, notes=notes)
+
+
+def _flat(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    """Names and values of what is no struct, depth first."""
     for name, value in content.items():
-        array = np.squeeze(np.asarray(value))
-        if array.ndim == 1 and array.dtype.kind in "fiub":
-            vectors[name] = array.astype(np.float64)
-    channels = [Channel(name) for name in vectors]
-    time = vectors[channels[time_column(path, channels, MAT_TIME_NAMES)].name]
-    used = [c for c in channels if len(vectors[c.name]) == len(time)]
-    used = [c for c in used if vectors[c.name] is not time]
-    left = [n for n in content if n not in {c.name for c in used} and vectors.get(n) is not time]
-    notes = [
-        f"'{name}' left out: it is no real vector of {len(time)} values, the length of the time"
-        for name in left
+        if name.startswith("@"):
+            continue
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
+            numbered = {f"{name}_{i + 1}": v for i, v in enumerate(value)}
+            yield from _flat(numbered, prefix)
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _time_name(numbers: Mapping[str, np.ndarray]) -> str | None:
+    """The time that lies least deep, the first of these."""
+    named = [
+        n
+        for n, v in numbers.items()
+        if n.rsplit(".", 1)[-1].lower() in MAT_TIME_NAMES and v.size > 1 and v.size == max(v.shape)
     ]
-    values = np.stack([vectors[c.name] for c in used], axis=1) if used else np.empty((len(time), 0))
-    return assemble(path, time, values, used, notes=notes)
+    return min(named, key=lambda n: n.count("."), default=None)
+
+
+def _own_time(name: str, numbers: Mapping[str, np.ndarray]) -> str | None:
+    """The time in the same struct as a variable, or in the nearest around it."""
+    folder = name
+    while "." in folder:
+        folder = folder.rsplit(".", 1)[0]
+        for other in numbers:
+            if other.rpartition(".")[0] == folder and (
+                other.rsplit(".", 1)[-1].lower() in MAT_TIME_NAMES
+            ):
+                return other
+    return None
+
+
+def _same_times(values: np.ndarray, time: Array) -> bool:
+    other = np.ravel(values)
+    return other.shape == time.shape and bool(np.allclose(other, time, rtol=1e-9, atol=0.0))
+
+
+def _without_time(
+    path: Path, found: Mapping[str, Any], numbers: Mapping[str, np.ndarray], step: float | None
+) -> tuple[Array, str]:
+    """Times of a record that tells its rate, and where that stands."""
+    source = "was told"
+    for name, value in numbers.items():
+        if step is None and value.size == 1:
+            step = rate_step(name.rsplit(".", 1)[-1], float(value.ravel()[0]))
+            source = f"stands in '{name}'"
+    if step is None:
+        raise no_time(path, [Channel(f"{n} ({_what(v)})") for n, v in found.items()])
+    lengths = [max(v.shape) for v in numbers.values() if v.size > 1]
+    if not lengths:
+        raise DfsmError(f"{path}: no signal, expected vectors of one length beside the rate")
+    # Signals of one record have one length; the one that most of them have.
+    count = max(dict.fromkeys(lengths), key=lengths.count)
+    return uniform_times(path, count, step), source
+
+
+def _along(values: np.ndarray | None, count: int) -> Array | None:
+    """Samples as ``(time, column)``; None where no dimension is as long as the time."""
+    if values is None or values.size == 0:
+        return None
+    array = np.squeeze(values)
+    # Simulink puts time last in signals of more than one dimension.
+    axes = [a for a in range(array.ndim) if array.shape[a] == count]
+    if not axes:
+        return None
+    table = np.moveaxis(array, axes[0] if array.ndim < 3 else axes[-1], 0).reshape(count, -1)
+    return table.astype(np.float64) if table.shape[1] <= _WIDEST else None
+
+
+def _why(value: Any, count: int, other: str | None) -> str:
+    if (
+        other is not None
+        and _along(value if isinstance(value, np.ndarray) else None, count) is not None
+    ):
+        return f"'{other}' is another time"
+    return f"it is {_what(value)}, no real vector of {count} values, the length of the time"
+
+
+def _what(value: Any) -> str:
+    """A variable in few words."""
+    if isinstance(value, np.ndarray):
+        return "empty" if not value.size else " x ".join(map(str, value.shape))
+    if isinstance(value, str):
+        return value if value is OTHER else "a text"
+    return f"{len(value)} cells" if isinstance(value, list) else "no numbers"
 
 
 def _strings(value: Any) -> list[str]:

@@ -1,4 +1,6 @@
-"""OpenFAST results: binary `.outb` (formats 1 to 4), text `.out`, and binary under the name `.out`.
+"""OpenFAST results: binary `.outb` (formats 1 to 4), text `.out`, one under the other's name.
+
+ROSCO's own logs are such text, too: a title, names, units.
 
 openfast-io decodes the samples but validates nothing, so a file is checked against its own header
 before that library sees it. Layout of the binary formats: `ReadFASTbinary.m` of NREL's
@@ -8,6 +10,7 @@ matlab-toolbox and `WrBinFAST` in OpenFAST's NWTC library.
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +22,7 @@ import numpy as np
 from dfsm.core.files import existing_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
+from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -27,6 +31,10 @@ DEFAULT_NAME_WIDTH = 10
 # OpenFAST uses 10 or 20 characters; anything far above is a corrupted header, not a name.
 MAX_NAME_WIDTH = 1024
 HEADER_LINES = 200
+# ROSCO's own logs: .dbg, .dbg2, .dbg3 by LoggingLevel (`Debug` in ROSCO_IO.f90).
+ROSCO_LOG = ".dbg"
+# A unit in brackets, blanks and all, or a word.
+BRACKETED = re.compile(r"\([^()]*\)|\[[^\[\]]*\]|\S+")
 
 
 def read_openfast(path: str | Path) -> Trajectory:
@@ -71,6 +79,7 @@ class _Header:
     names: tuple[str, ...]
     units: tuple[str, ...]
     scales: tuple[float, ...] | None
+    left_over: int
 
 
 def _read_binary(path: Path) -> Trajectory:
@@ -87,6 +96,11 @@ def _read_binary(path: Path) -> Trajectory:
     values = np.array(data[:, 1:], dtype=np.float64)
     codes = packed[:, 1:]
     notes = []
+    if header.left_over:
+        notes.append(
+            f"{header.left_over} bytes follow the {len(values)} samples that the header announces: "
+            "passed over, and the run may have gone on"
+        )
     channels = []
     for i, (name, unit) in enumerate(zip(header.names, header.units, strict=True)):
         step = None
@@ -137,13 +151,13 @@ def _check_header(path: Path) -> _Header:
         units = _texts(take(f"<{(count + 1) * width}s")[0], width)
         row = count * (8 if format_id == UNCOMPRESSED else 2) + 4 * (format_id == WITH_TIME)
         expected = stream.tell() + samples * row
-    if size != expected:
-        what = "truncated" if size < expected else "longer than it should be"
+    if size < expected:
         raise DfsmError(
-            f"{path} is {what}: its header announces {count} channels and {samples} samples, which "
-            f"makes {expected} bytes, but it has {size}; copy it again or rerun the simulation"
+            f"{path} is truncated: its header announces {count} channels and {samples} samples, "
+            f"which makes {expected} bytes, but it has {size}; copy it again or rerun the "
+            "simulation"
         )
-    return _Header(names[1:], tuple(map(_unit, units[1:])), scales)
+    return _Header(names[1:], tuple(map(_unit, units[1:])), scales, size - expected)
 
 
 def _taker(path: Path, stream: BinaryIO, size: int) -> Callable[[str], tuple]:
@@ -199,48 +213,74 @@ def _unit(text: str) -> str:
 
 
 def _read_text(path: Path) -> Trajectory:
-    line, names, units = _text_header(path)
-    skip = line + (units is not None)
-    load = _library("load_ascii_output")
-    try:
-        data, _ = load(
-            str(path),
-            headerLines=skip,
-            descriptionLine=0,
-            attributeLine=line - 1,
-            unitLine=skip - 1,
-        )
-        good = data.ndim == 2 and data.shape[1] == len(names)
-    except (ValueError, IndexError, OSError):
-        good = False
-        data = np.empty((0, 0))
-    if not good:
-        raise _bad_row(path, skip, len(names))
+    text = decode(path, "text or binary OpenFAST output")
+    lines = text.split("\n")
+    at, names, units = _text_header(path, lines)
+    below = at + (units is not None)
+    rows = [
+        Row(i, blank_cells(line))
+        for i, line in enumerate(lines[below:], start=below + 1)
+        if line.strip()
+    ]
+    if not rows:
+        raise DfsmError(f"{path}: no samples after its header, which ends in line {below}")
+    layout = Layout(
+        path=path,
+        names=names,
+        time=0,
+        ended=text.endswith("\n"),
+        columns="channels",
+        ragged=lambda _: (
+            "the run was cut off there or a value has filled its column; remove the line or rerun "
+            "with a wider OutFmt"
+        ),
+        wrong=lambda _: "correct it, or rerun with a wider OutFmt",
+    )
+    table = read_rows(rows, layout)
     units = units or [""] * len(names)
-    channels = [Channel(n, _unit(u)) for n, u in zip(names[1:], units[1:], strict=True)]
-    return assemble(path, data[:, 0], data[:, 1:], channels)
+    channels = [
+        Channel(n, _unit(u), s)
+        for n, u, s in zip(names[1:], units[1:], table.steps[1:], strict=True)
+    ]
+    time, values, notes = table.values[:, 0], table.values[:, 1:], list(table.notes)
+    for j in table.words:
+        notes.append(f"'{names[j]}' holds words ('{rows[0].cells[j][:24]}'): its samples are NaN")
+    if table.stamps is not None:
+        notes.append(table.stamps.note(names[0]))
+    if path.suffix.lower().startswith(ROSCO_LOG) and len(time) > 1 and time[0] == time[1]:
+        # ROSCO is called once before the simulation starts, and logs that call, too.
+        time, values = time[1:], values[1:]
+        notes.append(
+            f"the first of two rows at {time[0]:g} s left out: the controller's start call"
+        )
+    return assemble(path, time, values, channels, notes=notes)
 
 
-def _text_header(path: Path) -> tuple[int, list[str], list[str] | None]:
-    """Find the line (from 1) with the names, the names, and the units of the next line if any."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        # Drivers write headers of other lengths than OpenFAST, so the line is looked for. The
-        # length limit keeps a foreign file without line ends out of memory.
-        lines = [stream.readline(1_000_000) for _ in range(HEADER_LINES + 1)]
-    for number, text in enumerate(lines[:-1], start=1):
+def _text_header(path: Path, lines: list[str]) -> tuple[int, list[str], list[str] | None]:
+    """Find the line (from 1) with the names, the names, and the units of the next line if any.
+
+    Drivers write headers of other lengths than OpenFAST, so the line is looked for.
+    """
+    for line, text in enumerate(lines[:HEADER_LINES], start=1):
         names = text.split()
         if len(names) < 2 or names[0].lower() != "time":
             continue
-        units = lines[number].split()
-        if units and _is_number(units[0]):
-            return number, names, None
-        if len(units) == len(names):
-            return number, names, units
+        below = lines[line] if line < len(lines) else ""
+        first = below.split()[:1]
+        if first and (_is_number(first[0])):
+            return line, names, None
+        # Between tabs a unit may hold blanks or be empty; so may one in brackets hold blanks.
+        named, tabbed = _tabbed(text), _tabbed(below)
+        if len(named) > 1 and len(named) == len(tabbed):
+            return line, named, tabbed
+        for units in (below.split(), BRACKETED.findall(below)):
+            if len(units) == len(names):
+                return line, names, units
         # A title may begin with the word as well, but is not followed by units.
-        if units and units[0].startswith("("):
+        if first and first[0].startswith(("(", "[")):
             raise DfsmError(
-                f"{path}, line {number + 1}: {len(units)} units for the {len(names)} names in line "
-                f"{number}, one unit per name was expected: the file is cut off or foreign"
+                f"{path}, line {line + 1}: {len(below.split())} units for the {len(names)} names "
+                f"in line {line}, one unit per name was expected: the file is cut off or foreign"
             )
     raise DfsmError(
         f"{path} is no OpenFAST output: no line that starts with 'Time' among its first "
@@ -248,38 +288,13 @@ def _text_header(path: Path) -> tuple[int, list[str], list[str] | None]:
     )
 
 
-def _bad_row(path: Path, skip: int, columns: int) -> DfsmError:
-    """Say which line of a text file could not be read."""
-    try:
-        with path.open() as stream:
-            number = 0
-            for number, line in enumerate(stream, start=1):
-                if number <= skip:
-                    continue
-                fields = line.split()
-                if len(fields) != columns:
-                    return DfsmError(
-                        f"{path}, line {number}: {len(fields)} values, but the header names "
-                        f"{columns} channels: the run was cut off there or a value has filled its "
-                        "column; remove the line or rerun with a wider OutFmt"
-                    )
-                for column, text in enumerate(fields, start=1):
-                    if not _is_number(text):
-                        return DfsmError(
-                            f"{path}, line {number}: {text[:24]!r} in column {column} is no "
-                            "number: correct it, or rerun with a wider OutFmt"
-                        )
-    except UnicodeDecodeError:
-        return DfsmError(f"{path} is neither text nor binary OpenFAST output: check the file")
-    return DfsmError(f"{path}: no samples after its header, which ends in line {min(number, skip)}")
+def _tabbed(line: str) -> list[str]:
+    """Cells between tabs; one at the end of the line ends the last of them."""
+    return [cell.strip() for cell in line.removesuffix("\t").split("\t")]
 
 
 def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return number(text) is not None
 
 
 def _library(function: str) -> Callable[..., tuple]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -13,7 +15,15 @@ from numpy.typing import NDArray
 from dfsm.core.files import write_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
-from dfsm.data.readers.columns import SECONDS, kept_columns, split_header, time_column
+from dfsm.data.readers.columns import (
+    SECONDS,
+    kept_columns,
+    split_header,
+    time_column,
+    uniform_times,
+)
+from dfsm.data.readers.guard import check_run_name
+from dfsm.data.readers.stamps import Stamps, since_first
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.errors import DfsmError
 
@@ -21,13 +31,15 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 CODE_MIN, CODE_MAX = -32768, 32767
+# Key of the digest of all that is not in the pages.
+_HEADER = "dfsm.header"
 # How far, in steps, a sample may lie off the grid: rounding in float64 stays far below.
 GRID_SLACK = 1e-3
 # The codes' place in the 16-bit range is tried out where they leave room.
 MAX_SHIFTS = 64
 
 
-def read_parquet(path: Path) -> Trajectory:
+def read_parquet(path: Path, step: float | None = None) -> Trajectory:
     """Read a run from an existing Parquet file, see `dfsm.data.readers.tables.read_table`.
 
     Raises
@@ -39,15 +51,16 @@ def read_parquet(path: Path) -> Trajectory:
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0][:160]
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         raise DfsmError(
             f"{path} is no readable Parquet file ({reason}): it is damaged or of another kind; "
             "write it again"
         ) from error
     schema = _texts(table.schema.metadata)
+    _check_header(path, table, schema)
     units = _pandas_units(schema)
     fields = [_with_shared(path, field, schema) for field in table.schema]
     channels = [_channel(path, field, units) for field in fields]
@@ -56,9 +69,14 @@ def read_parquet(path: Path) -> Trajectory:
         at, start = None, _number(path, schema, "dfsm.time_start")
         time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
     else:
-        at = _time_index(path, table.schema, channels, schema)
-        time = columns[at]
+        at = _time_index(path, table.schema, channels, schema, step)
+        time = uniform_times(path, table.num_rows, step or 0.0) if at is None else columns[at]
     keep, notes = kept_columns(path, channels, columns, at)
+    for i in [i for i in keep if _is_stamped(fields[i])]:
+        keep.remove(i)
+        notes.append(f"column '{channels[i].name}' left out: it holds time stamps beside the time")
+    if at is not None and (first := _first_stamp(table, at)):
+        notes.append(Stamps(time, first).note(channels[at].name))
     if not keep:
         raise DfsmError(f"{path}: no channel besides time, at least one is needed")
     return assemble(
@@ -66,7 +84,7 @@ def read_parquet(path: Path) -> Trajectory:
         time,
         np.stack([columns[i] for i in keep], axis=1),
         [channels[i] for i in keep],
-        name=schema.get("dfsm.name"),
+        name=check_run_name(path, schema.get("dfsm.name", "")) or None,
         wall_time=_number(path, schema, "dfsm.wall_time") if "dfsm.wall_time" in schema else None,
         notes=(*_notes(path, schema), *notes),
     )
@@ -106,11 +124,36 @@ def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
             coded[channel.name] = "DELTA_BINARY_PACKED"
         fields.append(pa.field(channel.name, arrays[-1].type, metadata=known))
     table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=schema))
+    schema[_HEADER] = _header_digest(table)
+    table = table.replace_schema_metadata(schema)
     options: dict[str, Any] = {"compression": "zstd", "compression_level": 19 if packed else 3}
+    options["write_page_checksum"] = True
     if coded:
         options |= {"use_dictionary": False, "column_encoding": coded}
     with write_file(path) as temporary:
         pq.write_table(table, temporary, **options)
+
+
+def _header_digest(table: pa.Table) -> str:
+    """SHA-256 of what the checksums of pages leave out: sizes, names, types and metadata."""
+    fields = [[f.name, str(f.type), sorted(_texts(f.metadata).items())] for f in table.schema]
+    schema = {k: v for k, v in _texts(table.schema.metadata).items() if k != _HEADER}
+    text = json.dumps([table.num_rows, fields, sorted(schema.items())])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _check_header(path: Path, table: pa.Table, schema: Mapping[str, str]) -> None:
+    if _HEADER in schema:
+        whole = schema[_HEADER] == _header_digest(table)
+    else:
+        # A damaged list of metadata is passed over by the library as if there were none.
+        with path.open("rb") as stream:
+            stream.seek(-8, os.SEEK_END)
+            size = int.from_bytes(stream.read(4), "little")
+            stream.seek(-8 - size, os.SEEK_END)
+            whole = _HEADER.encode() not in stream.read(size)
+    if not whole:
+        raise DfsmError(f"{path} is damaged, its header is not as it was written: write it again")
 
 
 # -- packing ------------------------------------------------------------------------------------
@@ -193,6 +236,8 @@ def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
     import pyarrow as pa
 
     kind = field.type
+    if _is_stamped(field):
+        return since_first(_nanoseconds(table, index))
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
         raise DfsmError(
             f"{path}: column '{field.name}' holds {kind}, expected numbers: leave it out"
@@ -208,9 +253,16 @@ def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
 
 
 def _time_index(
-    path: Path, schema: pa.Schema, channels: list[Channel], metadata: Mapping[str, str]
-) -> int:
-    """Column that holds the time: by its name, or the float index of a pandas table."""
+    path: Path,
+    schema: pa.Schema,
+    channels: list[Channel],
+    metadata: Mapping[str, str],
+    step: float | None,
+) -> int | None:
+    """Column that holds the time: by its name, or the index of a pandas table.
+
+    An index counts where its numbers are floats or stamps. None where only `step` tells the time.
+    """
     import pyarrow as pa
 
     try:
@@ -222,9 +274,42 @@ def _time_index(
             raise DfsmError(f"{path}: its pandas metadata are damaged; write it again") from None
         if len(index) == 1 and isinstance(index[0], str) and index[0] in schema.names:
             at = schema.names.index(index[0])
-            if pa.types.is_floating(schema.field(at).type) and channels[at].unit in SECONDS:
+            field = schema.field(at)
+            known = pa.types.is_floating(field.type) or _is_stamped(field)
+            if known and channels[at].unit in SECONDS:
                 return at
+        if step is not None:
+            return None
         raise
+
+
+def _is_stamped(field: pa.Field) -> bool:
+    """Whether a column holds time stamps, times of day or durations."""
+    import pyarrow as pa
+
+    kind = field.type
+    return pa.types.is_timestamp(kind) or pa.types.is_time(kind) or pa.types.is_duration(kind)
+
+
+def _nanoseconds(table: pa.Table, index: int) -> NDArray[np.int64]:
+    """Stamps of a column in ns."""
+    import pyarrow as pa
+
+    column = table.column(index)
+    unit = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}[column.type.unit]
+    if pa.types.is_time32(column.type):
+        column = column.cast(pa.int32())
+    return column.cast(pa.int64()).to_numpy() * unit
+
+
+def _first_stamp(table: pa.Table, index: int) -> str | None:
+    """The first time stamp of a column as text; None where it holds numbers."""
+    import pyarrow as pa
+
+    kind = table.column(index).type
+    if not (pa.types.is_timestamp(kind) or pa.types.is_time(kind)):
+        return None
+    return str(table.column(index)[0].as_py()) if table.num_rows else None
 
 
 def _pandas_units(metadata: Mapping[str, str]) -> dict[str, str]:

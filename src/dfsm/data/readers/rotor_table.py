@@ -17,7 +17,6 @@ import numpy as np
 
 from dfsm.core.files import existing_file
 from dfsm.core.types import Array, IntArray
-from dfsm.core.units import ANGLES
 from dfsm.data.readers.columns import split_header
 from dfsm.errors import DfsmError
 
@@ -277,7 +276,7 @@ def _columns(path: Path, header: Sequence[str]) -> tuple[dict[str, int], str]:
         columns[field] = i
         if field == "pitch" and told:
             unit = _UNITS.get(told.casefold(), told)
-            if unit not in ANGLES:
+            if unit not in ("deg", "rad"):
                 raise DfsmError(
                     f"{path}: blade pitch is in '{told}', expected deg or rad: convert it"
                 )

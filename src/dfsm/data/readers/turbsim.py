@@ -6,8 +6,9 @@ stays in it; one that repeats itself begins at the rotor (InflowWind, ``IfW_Turb
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from dfsm.errors import DfsmError
 # Format number, grid sizes, spacings and scales; then the length of a description.
 _HEADER = struct.Struct("<h4i6f6fi")
 _FORMATS = {7: False, 8: True}  # whether the field repeats itself
+# Of wind in m/s, and of heights in m: no turbine meets more.
+_MOST_WIND = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +85,30 @@ def read_turbsim(path: str | Path) -> TurbSimField:
         )
     kind, nz, ny, towers, count, dz, dy, dt, mean, hub, bottom, *scales, text = _HEADER.unpack(head)
     sizes = min(nz, ny) >= 2 and towers >= 0 and count >= 2 and text >= 0
-    if not (sizes and min(dz, dy, dt, mean) > 0 and scales[0] != 0):
-        raise DfsmError(f"{path}: the header of the wind field makes no sense: write it again")
+    if not sizes:
+        raise DfsmError(
+            f"{path}: the header of the wind field makes no sense ({nz} x {ny} points, {towers} on "
+            f"the tower, {count} steps): write it again"
+        )
+    _check_numbers(
+        path,
+        {
+            "grid spacing upwards (dz) in m": (dz, dz > 0),
+            "grid spacing sideways (dy) in m": (dy, dy > 0),
+            "time step (dt) in s": (dt, dt > 0),
+            "mean wind (UHub) in m/s": (mean, 0 < mean < _MOST_WIND),
+            "hub height (HubHt) in m": (hub, hub > 0),
+            "height of the lowest points (ZBot) in m": (bottom, bottom > -_MOST_WIND),
+            "slope of u": (scales[0], scales[0] > 0),
+            "offset of u": (scales[1], True),
+        },
+    )
+    low, high = ((code - scales[1]) / scales[0] for code in (-32768, 32767))
+    if max(abs(low), abs(high)) > _MOST_WIND:
+        raise DfsmError(
+            f"{path}: the slope and offset of u in its header, {scales[0]:g} and {scales[1]:g}, "
+            f"make winds from {low:.3g} to {high:.3g} m/s of its integers: write the field again"
+        )
     start = _HEADER.size + text
     expected = start + 2 * count * 3 * (ny * nz + towers)
     if path.stat().st_size != expected:
@@ -108,3 +133,13 @@ def read_turbsim(path: str | Path) -> TurbSimField:
         towers=towers,
         start=start,
     )
+
+
+def _check_numbers(path: Path, numbers: Mapping[str, tuple[float, bool]]) -> None:
+    """Refuse a header with a number that makes no sense; the field of the header is named."""
+    for name, (value, good) in numbers.items():
+        if not (math.isfinite(value) and good):
+            raise DfsmError(
+                f"{path}: its header gives the {name} as {value:g}, which makes no sense: write "
+                "the field again"
+            )

@@ -8,6 +8,8 @@ inside; the values that go in and come out are in physical units.
 
 from __future__ import annotations
 
+import numpy as np
+
 from dfsm.core.types import Array, IntArray
 from dfsm.fitting.corrective.gaussian_process import GP
 from dfsm.fitting.corrective.none import NoCorrection
@@ -32,7 +34,12 @@ CorrectiveSettings = RBF | IncrementalRBF | GP | MLP | NoCorrection
 
 
 def fit_corrective(
-    inputs: Array, residuals: Array, runs: IntArray, settings: CorrectiveKind, seed: int = 0
+    inputs: Array,
+    residuals: Array,
+    runs: IntArray,
+    settings: CorrectiveKind,
+    seed: int = 0,
+    weights: Array | None = None,
 ) -> CorrectiveFit | None:
     """Train a corrective function on the residuals of the linear fit (Sec. 3.6).
 
@@ -49,6 +56,8 @@ def fit_corrective(
         Kind and settings.
     seed
         Seed of subsampling and initial weights.
+    weights
+        Of the samples by the time that they stand for, ``(sample,)``; None takes all alike.
 
     Returns
     -------
@@ -60,4 +69,10 @@ def fit_corrective(
     DfsmError
         More units than samples.
     """
+    if weights is not None:
+        # Samples that stand for equal times: every kind of training then weighs them alike.
+        ends = np.cumsum(weights)
+        places = (np.arange(len(weights)) + 0.5) / len(weights) * ends[-1]
+        kept = np.unique(np.searchsorted(ends, places))
+        inputs, residuals, runs = inputs[kept], residuals[kept], runs[kept]
     return settings.train(TrainingSet.build(inputs, residuals, runs), seed)

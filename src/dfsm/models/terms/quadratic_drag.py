@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from dfsm.core.settings import settings_class
+from dfsm.core.units import agree
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.models.terms.form import Term
@@ -68,7 +69,7 @@ class QuadraticDrag:
         """
         taken, at = input_columns(self.kind, self.inputs, channels, columns)
         units = [c.unit for c in taken]
-        if len(set(units)) > 1:
+        if not agree(*units):
             raise DfsmError(
                 f"{self.kind}: '{self.velocity}' is in '{units[0]}' and '{self.against}' in "
                 f"'{units[1]}', expected one unit: convert one of them"

@@ -14,7 +14,7 @@ import numpy as np
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
-from dfsm.core.units import ANGLES, SPEEDS, plain
+from dfsm.core.units import factor
 from dfsm.data.readers.rotor_table import RotorTable, read_rotor_table
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
@@ -27,7 +27,7 @@ from dfsm.models.terms.rotor_surface import TOLERANCE, Grid, make_surface, surfa
 _AIR, _WATER = (0.8, 1.6), (950.0, 1100.0)
 # A tip speed below this, in m/s, counts as this: φ has no direction where nothing moves.
 _CALM = 0.01
-_RATES = {unit: SPEEDS[unit] for unit in ("rad/s", "deg/s")}
+_SPEEDS = ("rpm", "rad/s", "deg/s")
 
 
 @settings_class
@@ -155,16 +155,16 @@ class Rotor:
             named = getattr(self, key)
             for name in named if isinstance(named, tuple) else (named,):
                 if name is not None:
-                    _factor(what, key, channels[name], {"m/s": 1.0})
-        speed = _factor(what, "speed", channels[self.speed], SPEEDS) / self.gearbox_ratio
-        pitch = _factor(what, "pitch", channels[self.pitch], ANGLES)
+                    _same(what, key, channels[name], "m/s")
+        speed = _factor(what, "speed", channels[self.speed], _SPEEDS) / self.gearbox_ratio
+        pitch = _factor(what, "pitch", channels[self.pitch], ("rad", "deg"))
         arm = None
         if self.pitch_rate is not None and self.hub_height is not None:
-            rate = _factor(what, "pitch_rate", channels[self.pitch_rate], _RATES)
+            rate = _factor(what, "pitch_rate", channels[self.pitch_rate], _SPEEDS[1:])
             arm = self.hub_height * rate
         if self.generator_torque is not None:
             braking = input_columns(what, (self.generator_torque,), channels, columns)[0]
-            _factor(what, "generator_torque", braking[0], {"kNm": 1.0})
+            _same(what, "generator_torque", braking[0], "kNm")
         table = self.table
         if not isinstance(table, RotorTable):
             table = read_rotor_table(table)
@@ -183,8 +183,8 @@ class Rotor:
             ratios=(float(table.tip_speed_ratio[0]), float(table.tip_speed_ratio[-1])),
             angles=(float(table.pitch[0]), float(table.pitch[-1])),
             optimum=table.optimum[0],
-            speed_unit=plain(channels[self.speed].unit),
-            pitch_unit=plain(channels[self.pitch].unit),
+            speed_unit=channels[self.speed].unit,
+            pitch_unit=channels[self.pitch].unit,
             error=error,
         )
         return RotorTerm(
@@ -203,14 +203,23 @@ class Rotor:
         return np.array([wind / s if s > 0 and wind > 0 else 1.0 for s in sizes])
 
 
-def _factor(what: str, key: str, channel: Channel, units: Mapping[str, float]) -> float:
-    unit = plain(channel.unit)
-    if unit not in units:
+def _factor(what: str, key: str, channel: Channel, units: Sequence[str]) -> float:
+    """What one unit of a channel is in rad or rad/s, of which `units` are the usual ones."""
+    size = factor(channel.unit, next(u for u in units if u.startswith("rad")))
+    if size is None:
         raise DfsmError(
             f"{what}: its {key} '{channel.name}' is in '{channel.unit}', expected "
             f"{' or '.join(units)}: name another channel or convert it"
         )
-    return units[unit]
+    return size
+
+
+def _same(what: str, key: str, channel: Channel, unit: str) -> None:
+    if factor(channel.unit, unit) != 1.0:
+        raise DfsmError(
+            f"{what}: its {key} '{channel.name}' is in '{channel.unit}', expected {unit}: name "
+            "another channel or convert it"
+        )
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.types import Array
-from dfsm.core.units import SPEEDS
+from dfsm.core.units import agree, factor
 from dfsm.errors import DfsmError
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ def _check_ratio(term: RotorTerm, wind: Array, tips: Array) -> list[str]:
         f"table ({low:g} to {high:g}), their median is {median:.3g}"
     )
     if share >= _REFUSED:
-        now = SPEEDS[about.speed_unit]
-        others = [u for u, f in SPEEDS.items() if low <= median * f / now <= high]
+        size = {u: factor(u, about.speed_unit) or np.nan for u in ("rpm", "rad/s", "deg/s")}
+        others = [u for u, f in size.items() if low <= median * f <= high]
         hint = f"; were '{speed}' in {others[0]}, it would lie within it" if others else ""
         raise DfsmError(
             f"{told}{hint}: check the unit of '{speed}', the radius {about.radius:g} m, the "
@@ -107,7 +107,7 @@ def _check_degrees(
     """
     about = term.about
     largest = float(np.abs(pitch).max())
-    if about.pitch_unit != "deg" or largest > _RADIANS:
+    if not agree(about.pitch_unit, "deg") or largest > _RADIANS:
         return []
     if np.rad2deg(largest) > max(abs(a) for a in about.angles):
         return []

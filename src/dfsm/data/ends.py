@@ -1,0 +1,106 @@
+"""Rows at either end of a table that were never recorded: zeros, or the same row again and again.
+
+A system at rest looks alike at first: all its rows are the same until an input steps. Then only the
+input jumps, and the rest starts from where it stood. Rows that were not recorded end where (almost)
+all channels jump at once; a record that freezes stops (almost) all of them in mid-motion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dfsm.core.types import Array
+
+# Fewer equal rows than this happen by chance in quantised files.
+_FEWEST = 3
+# Share of the channels that vary which must jump, or stop moving, at the same time.
+_ALMOST_ALL = 0.7
+# What is a jump and what a standstill, in changes from row to row beside it, and the share of the
+# usual change (RMS over the run) that counts as motion.
+_JUMP, _MOTION = 3.0, 0.3
+# Rows beside the boundary that tell how channels move there; one may be at a turn for a while.
+_BESIDE, _WHILE = 4, 20
+# Times the longest row of equal rows inside that those at the end must be: some files round a lot.
+_LONGER = 3
+
+
+def recorded_rows(time: Array, values: Array) -> tuple[slice, list[str]]:
+    """Find the rows that were recorded.
+
+    Parameters
+    ----------
+    time
+        In s, shape ``(time,)``.
+    values
+        Shape ``(time, channel)``.
+
+    Returns
+    -------
+    tuple[slice, list[str]]
+        The rows to keep, and one sentence per end that is left out.
+    """
+    count, notes = len(values), list[str]()
+    head, tail = _equal_rows(values), _equal_rows(values[::-1])
+    if max(head, tail) > count - 2 * _BESIDE:
+        return slice(0, count), notes
+    start, stop = 0, count
+    if head and _jumps(values[head - 1 :]):
+        start = head
+        notes.append(_told("first", values[:head], time[:head]))
+    if tail:
+        back = values[: count - tail + 1][::-1]
+        if _jumps(back):
+            stop = count - tail
+        elif tail > _LONGER * _longest(values[: count - tail]) and _freezes(back):
+            stop = count - tail + 1  # the first of the equal rows is as it was
+        if stop < count:
+            notes.append(_told("last", values[stop:], time[stop:]))
+    return slice(start, stop), notes
+
+
+def _equal_rows(values: Array) -> int:
+    """Number of rows at the beginning in which every channel is as in the first; 0 for too few."""
+    differs = np.flatnonzero((values != values[0]).any(axis=1))
+    count = int(differs[0]) if len(differs) else len(values)
+    return count if count >= _FEWEST else 0
+
+
+def _longest(values: Array) -> int:
+    """Length of the longest row of equal rows, at least 1."""
+    changes = np.flatnonzero((np.diff(values, axis=0) != 0).any(axis=1))
+    return int(np.diff(changes, prepend=-1, append=len(values) - 1).max())
+
+
+def _changes(values: Array, rows: int) -> tuple[Array, Array, Array]:
+    """Of channels that vary: the first change, the usual one, and that in the rows beside (RMS)."""
+    changes = np.diff(values[:, np.isfinite(values).all(axis=0)], axis=0)
+    with np.errstate(over="ignore"):  # infinite is large enough to compare with
+        usual = np.sqrt(np.mean(changes[1:] ** 2, axis=0))
+        beside = np.sqrt(np.mean(changes[1 : 1 + rows] ** 2, axis=0))
+    varies = usual > 0
+    return np.abs(changes[0, varies]), usual[varies], beside[varies]
+
+
+def _jumps(values: Array) -> bool:
+    """Whether almost all channels jump from the first row, the last equal one, to the second."""
+    first, usual, beside = _changes(values, _BESIDE)
+    jump = first > _JUMP * np.maximum(beside, _MOTION * usual)
+    return len(jump) > 0 and bool(jump.mean() >= _ALMOST_ALL)
+
+
+def _freezes(values: Array) -> bool:
+    """Whether almost all channels are in motion beside the first row, the first equal one.
+
+    One that has settled moves less and less before.
+    """
+    _, usual, beside = _changes(values, _WHILE)
+    moving = beside > _MOTION * usual
+    return len(moving) > 0 and bool(moving.mean() >= _ALMOST_ALL)
+
+
+def _told(which: str, values: Array, time: Array) -> str:
+    what = "hold the same values" if values[0].any() else "are zero"
+    return (
+        f"the {which} {len(time)} rows ({time[0]:g} to {time[-1]:g} s) {what} in every channel, as "
+        "where nothing was recorded: left out"
+    )

@@ -1,0 +1,102 @@
+"""What samples show of how a channel was made: angles that wrap, held values, a bad start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dfsm.core.types import Array
+
+_PERIODS = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0, "rad": 2 * np.pi}
+# Fewer samples than this show nothing.
+_FEWEST = 20
+# Changes that make a rate, and the share of them that must be equally far apart.
+_CHANGES, _REGULAR = 5, 0.9
+# Times the usual change from sample to sample that the first one is, where it is a jump.
+_JUMP = 10.0
+# Standard deviations of the second half within which all of it stays, but not the first tenth.
+_FAR = 6.0
+
+
+@dataclass(frozen=True)
+class Wrap:
+    """An angle that begins again: its period in the channel's unit, how often, when first in s."""
+
+    period: float
+    times: int
+    first: float
+
+
+def wrapping(time: Array, values: Array, unit: str) -> Wrap | None:
+    """Whether an angle begins again after a turn.
+
+    Parameters
+    ----------
+    time, values
+        Shape ``(time,)``, in s and in `unit`.
+    unit
+        Of an angle; without one both degrees and radians are tried.
+
+    Returns
+    -------
+    Wrap | None
+        None where all steps are those of a motion.
+    """
+    plain = unit.strip().lower()
+    if len(values) < _FEWEST or not np.isfinite(values).all():
+        return None
+    for period in [_PERIODS[plain]] if plain in _PERIODS else [] if plain else [360.0, 2 * np.pi]:
+        # A step too many may lie between the last sample before the turn and the first after it.
+        if not 0.75 * period < np.ptp(values) <= period * (1 + 1e-6):
+            continue
+        steps = np.diff(values)
+        turns = np.abs(steps) > period / 2
+        moved = np.abs(steps[turns] - period * np.round(steps[turns] / period))
+        usual = np.quantile(np.abs(steps[~turns]), 0.95) if (~turns).any() else 0.0
+        if turns.any() and 0 < usual < period / 4 and moved.max() <= 2 * usual:
+            return Wrap(period, int(turns.sum()), float(time[1:][turns][0]))
+    return None
+
+
+def held_interval(time: Array, values: Array) -> float | None:
+    """Interval in s at which a channel changes, where it stays as it was in between.
+
+    Returns
+    -------
+    float or None
+        None where it changes at every sample, or at no regular ones.
+    """
+    if len(values) < _FEWEST or not np.isfinite(values).all():
+        return None
+    changes = np.flatnonzero(np.diff(values) != 0)
+    if len(changes) < _CHANGES or len(changes) > 0.6 * len(values):
+        return None
+    apart = np.diff(changes)
+    usual = int(np.median(apart))
+    # A value that happens to be the same twice makes a gap of twice the length.
+    if usual < 2 or np.mean(apart == usual) < _REGULAR or (apart % usual).any():
+        return None
+    return float(np.median(np.diff(time[changes])))
+
+
+def jumps_at_first(values: Array) -> bool:
+    """Whether the first sample has nothing to do with those that follow."""
+    if len(values) < _FEWEST or not np.isfinite(values).all():
+        return False
+    steps = np.abs(np.diff(values))
+    usual, near = np.sqrt(np.mean(steps[1:] ** 2)), steps[1:_FEWEST].max()
+    return bool(usual > 0 and steps[0] > _JUMP * max(near, 0.1 * usual) and steps[0] > 2 * usual)
+
+
+def transient_end(time: Array, values: Array) -> float | None:
+    """Time in s until which a channel is far from all that it does later; None for none."""
+    half, tenth = len(values) // 2, len(values) // 10
+    if tenth < _FEWEST or not np.isfinite(values).all():
+        return None
+    later = values[half:]
+    far = np.abs(values - later.mean()) > _FAR * later.std()
+    if not later.std() > 0 or not far[:tenth].any() or far[half:].any():
+        return None
+    # What is far later on is no part of the start.
+    return float(time[np.flatnonzero(far[: 2 * tenth])[-1]])

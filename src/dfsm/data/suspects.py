@@ -1,0 +1,155 @@
+"""Samples and runs that cannot belong to the rest: a stray sample, a run in another unit.
+
+Least squares has no defence against them: one sample a million times the others decides every
+coefficient, and a square of 1e160 is no number any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from dfsm.core.types import Array, IntArray
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+
+Suspects = Literal["refuse", "drop", "keep"]
+SUSPECTS: tuple[str, ...] = get_args(Suspects)
+
+# Beyond this, squares and their sums leave the range of numbers.
+_HUGE = 1e100
+# A few samples are strays where they are so many times further from the median than all others.
+_STRAY, _FEW = 1e3, 5
+# Factors between units that bear one name in files: thousands, rad and deg, rad/s and rpm.
+_FACTORS = {
+    1000.0: "a thousand",
+    1e6: "a million",
+    180 / np.pi: "deg per rad",
+    30 / np.pi: "rpm per rad/s",
+}
+# How far off a factor may be, and how far apart the other runs.
+_NEAR, _ALIKE = 0.2, 2.0
+_ADVICE = "correct it, or set data.outliers to drop (or to keep, if it is right)"
+
+
+def screened(
+    runs: Sequence[Trajectory],
+    names: Iterable[str],
+    what: Suspects,
+    window: tuple[float | None, float | None],
+) -> list[Trajectory]:
+    """Refuse runs with samples that cannot be, or do without these.
+
+    Parameters
+    ----------
+    runs
+        Whole records.
+    names
+        Channels to look at; those that a run lacks are passed over.
+    what
+        ``"refuse"``; ``"drop"`` bridges stray samples by straight lines and leaves out runs in
+        another unit; ``"keep"`` looks at nothing.
+    window
+        Start and stop in s of what is compared between runs.
+
+    Raises
+    ------
+    DfsmError
+        Names the run, the channel and the time of the first suspect, or the factor.
+    """
+    if what == "keep":
+        return list(runs)
+    names = list(dict.fromkeys(names))
+    kept = [_without_strays(run, [n for n in names if n in run], what) for run in runs]
+    for name in names:
+        if not all(name in run for run in kept):
+            continue
+        odd = _other_unit([run.window(*window) for run in kept], name)
+        if odd is None:
+            continue
+        place, factor, word = odd
+        if what == "refuse" or len(kept) == 2:  # which of two is wrong, nobody knows
+            run = kept[place]
+            unit = run.channel(name).unit or "no unit"
+            raise DfsmError(
+                f"{run.where}: '{name}' ({unit}) is {factor:.3g} times what it is in the other "
+                f"runs, in mean, spread and range ({word}), as if in another unit: {_ADVICE}"
+            )
+        del kept[place]
+    return kept
+
+
+def _without_strays(run: Trajectory, names: Sequence[str], what: Suspects) -> Trajectory:
+    values: Array | None = None
+    for name in names:
+        samples = run[name]
+        strays = _strays(samples)
+        if not len(strays):
+            continue
+        if what == "refuse" or len(strays) > _FEW:
+            first = strays[0]
+            more = f" (and {len(strays) - 1} more)" if len(strays) > 1 else ""
+            raise DfsmError(
+                f"{run.where}: '{name}' is {samples[first]:.4g} at {run.time[first]:g} s{more}, "
+                f"far beyond all its other samples: {_ADVICE}"
+            )
+        good = np.ones(len(samples), dtype=bool)
+        good[strays] = False
+        values = run.values.copy() if values is None else values
+        bridged = np.interp(run.time[strays], run.time[good], samples[good])
+        values[strays, run.column(name)] = bridged
+    return run if values is None else replace(run, values=values)
+
+
+def _strays(samples: Array) -> IntArray:
+    """Rows of the samples that are huge, or a few that are far from all others."""
+    finite = np.isfinite(samples)
+    huge = np.flatnonzero(finite & (np.abs(np.where(finite, samples, 0.0)) > _HUGE))
+    if len(huge) or len(samples) <= 2 * _FEW:
+        return huge
+    good = samples[finite]
+    if len(good) <= 2 * _FEW:
+        return huge
+    middle = float(np.median(good))
+    off = np.where(finite, np.abs(np.where(finite, samples, middle) - middle), 0.0)
+    order = np.argsort(-off, kind="stable")[: _FEW + 1]
+    far = off[order]
+    for count in range(1, _FEW + 1):
+        if far[count] > 0 and far[count - 1] > _STRAY * far[count]:
+            return np.sort(order[:count])
+    return huge
+
+
+def _other_unit(runs: Sequence[Trajectory], name: str) -> tuple[int, float, str] | None:
+    """The run that is off by the factor of a unit from all others, which agree."""
+    if len(runs) < 2:
+        return None
+    figures = []
+    for run in runs:
+        samples = run[name]
+        if not np.isfinite(samples).all():
+            return None
+        figures.append((samples.std(), np.ptp(samples), abs(samples.mean())))
+    table = np.array(figures)
+    for place in range(len(runs)):
+        others = np.delete(table, place, axis=0)
+        usual = np.median(others, axis=0)
+        # A mean of nearly nothing says nothing.
+        told = np.array([True, True, usual[2] > usual[0]])
+        if not (usual[told] > 0).all() or not (table[place, told] > 0).all():
+            continue
+        if (others[:, told].max(0) > _ALIKE * usual[told]).any():
+            continue
+        if (others[:, told].min(0) * _ALIKE < usual[told]).any():
+            continue
+        ratio = np.log(table[place, told] / usual[told])
+        # No run is exactly like another: each figure may differ by as much as the others do.
+        scatter = np.abs(np.log(others[:, told] / usual[told])).max() + _NEAR
+        for factor, word in _FACTORS.items():
+            for sign, text in ((1, word), (-1, f"1 / {word}")):
+                if np.abs(ratio - sign * np.log(factor)).max() <= scatter:
+                    return place, float(np.exp(ratio.mean())), text
+    return None

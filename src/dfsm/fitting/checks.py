@@ -1,0 +1,98 @@
+"""What `fit` looks at last: finite values, stability, rollouts over training runs, verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from dfsm.data.dataset import Dataset
+from dfsm.errors import DfsmError, hushed
+from dfsm.fitting.contraction import contraction
+from dfsm.fitting.doubts import Doubts
+from dfsm.fitting.samples import Samples, data_warnings
+from dfsm.fitting.settings import FitSettings
+from dfsm.fitting.verdicts import Evidence, verdicts
+from dfsm.models.dfsm import DFSM
+from dfsm.models.stability import growths, places
+from dfsm.simulation.simulate import Status, simulate
+
+# Training runs that are simulated to check a new model, and those of them along which pairs of
+# rollouts from different initial states are followed.
+_CHECK_RUNS, _PAIRED_RUNS = 8, 3
+
+
+def check(
+    model: DFSM, samples: Samples, data: Dataset, settings: FitSettings, doubt: Doubts
+) -> tuple[list[str], list[str], dict[str, Any]]:
+    """Look for what would surprise a user: non-finite values, instability, leaking disturbances.
+
+    Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
+    The last of what is returned are growths and verdicts, for the record.
+    """
+    notes = data_warnings(data, settings, samples)
+    x, u, w, p = model.split(samples.inputs)
+    values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
+    if not np.isfinite(values).all():
+        raise DfsmError(
+            "the fitted model is not finite on its own training samples: fewer "
+            "corrective.samples, or another corrective.kind, may cure it"
+        )
+    columns = samples.signals.state_columns
+    errors = None if doubt.outdated else doubt.errors[:, columns]
+    longest = max(run.window(settings.start, settings.stop).duration for run in data)
+    growing = growths(model, longest, errors)
+    if unstable := [g for g in growing if g.unstable]:
+        what = "linear fit" if model.e is None else "model"
+        cure = (
+            "right for an unstable system; for any other set linear.margin, or expect rollouts to "
+            "drift off"
+        )
+        if not doubt.cured_by_margin:
+            cure = "what is told of its inputs may be why, and is to be mended first"
+        notes.append(
+            f"the {what} is unstable at {places(unstable, model.schedule)} (fastest growth "
+            f"{max(g.rate for g in unstable):.3g} 1/s): {cure}"
+        )
+    tried = np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int)).tolist()
+    some = [data[i] for i in tried]
+    with hushed():
+        rollouts = simulate(model, some, start=settings.start, stop=settings.stop)
+    done = sum(r.status is Status.COMPLETED for r in rollouts)
+    checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]
+    if done < len(some):
+        worst = min(
+            (r for r in rollouts if r.status is not Status.COMPLETED), key=lambda r: r.ended
+        )
+        notes.append(f"only {checks[0]}; {worst.trajectory.name}: {worst.reason}")
+    few = slice(None, None, -(-len(some) // _PAIRED_RUNS))
+    outcome = contraction(model, some[few], rollouts[few], settings.start, settings.stop)
+    if outcome is not None:
+        checks.append(outcome.account)
+        if outcome.unexpected:
+            notes.append(f"{outcome.account}, although {_unexpected(model)}")
+    evidence = Evidence(
+        rollouts=dict(zip(tried, rollouts, strict=True)),
+        doubts=None if doubt.outdated else doubt,
+        growths=growing,
+        refined=doubt.outdated,
+    )
+    judged = {
+        "growth": [asdict(g) for g in growing],
+        "verdicts": verdicts(samples, settings, evidence),
+    }
+    return notes, checks, judged
+
+
+def _unexpected(model: DFSM) -> str:
+    """What ought to have made states come together, and what to do where it did not."""
+    if model.schedule:
+        return (
+            f"every linear fit is stable with {model.schedule} frozen: as it moves, the model is "
+            "not; use fewer linear.points, a larger linear.margin or another linear.schedule"
+        )
+    return (
+        "the linear fit is stable: right for a system with several equilibria; for any other set "
+        "linear.margin, or correct less (gate, corrective)"
+    )

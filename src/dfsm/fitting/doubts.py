@@ -1,0 +1,171 @@
+"""What speaks against the coefficients of a linear fit: feedback, dead time, noise, few samples.
+
+Each question has a file of its own; here they are put to every row that was fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.data.derivatives import kinematic_rows
+from dfsm.fitting.delays import late_input, late_note
+from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
+from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
+from dfsm.fitting.noisy_inputs import noise_shares
+from dfsm.fitting.residuals import Residuals, residuals_of
+from dfsm.fitting.samples import Samples
+from dfsm.fitting.settings import FitSettings
+from dfsm.fitting.standard_errors import standard_errors
+
+# A coefficient matters where its input makes so much of a row, and is not known where it is less
+# than so many standard errors.
+_MATTERS, _KNOWN = 0.2, 1.0
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What was asked of a fit, and the answers.
+
+    Attributes
+    ----------
+    notes
+        One sentence each.
+    errors
+        Standard errors of the coefficients, ``(row, input)``; NaN in rows that are not fitted.
+    biased
+        Names of the rows whose controls follow the states.
+    late
+        Names of the rows on which an input acts late.
+    outdated
+        Whether rollouts have changed the coefficients since.
+    """
+
+    notes: tuple[str, ...]
+    errors: Array
+    biased: tuple[str, ...] = ()
+    late: tuple[str, ...] = ()
+    outdated: bool = False
+
+    @property
+    def cured_by_margin(self) -> bool:
+        """Whether a growth of the fit may be what `linear.margin` is there for."""
+        return self.outdated or not (self.biased or self.late)
+
+
+def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings) -> Doubts:
+    """Question the linear fit of the derivatives.
+
+    Parameters
+    ----------
+    samples
+        All training samples.
+    fit
+        Of all derivatives, kinematic rows included.
+    left
+        What it leaves of them, ``(sample, state)``.
+    settings
+        Settings.
+    """
+    inputs, kinematic = samples.linear_inputs, kinematic_rows(settings.states)
+    mean = fit.mean_coefficients
+    errors = np.full(mean.shape, np.nan)
+    notes: list[str] = []
+    biased, late = [], []
+    laws: dict[int, Law] = {}
+    names, driving = samples.linear_names, len(samples.signals.driving)
+    for row in (r for r in range(len(mean)) if r not in kinematic):
+        name, target = samples.derivative_names[row][0], samples.derivatives[:, row]
+        errors[row] = standard_errors(inputs, left[:, row], samples.runs)
+        held = {column for r, column in fit.model.known if r == row}
+        errors[row, list(held)] = 0.0
+        notes += _noise(name, samples, inputs, target, mean[row])
+        series = residuals_of(samples.time, samples.runs, inputs, target, left[:, row])
+        note = None if series is None else _feedback(name, samples, series, mean, row, held, laws)
+        if note:
+            notes.append(note)
+            biased.append(name)
+            continue
+        if not fit.moved:  # for a margin it is no longer the best fit
+            notes += _unknown(name, names, mean[row], errors[row], inputs, target, fit.condition)
+        if series is not None and (found := late_input(series, range(driving))):
+            notes.append(late_note(name, names[found.column], found, series.unexplained))
+            late.append(name)
+    return Doubts(tuple(notes), errors, tuple(biased), tuple(late))
+
+
+def _feedback(
+    name: str,
+    samples: Samples,
+    series: Residuals,
+    mean: Array,
+    row: int,
+    held: set[int],
+    laws: dict[int, Law],
+) -> str | None:
+    if not much_unexplained(series):
+        return None
+    order = samples.signals.order
+    states = order.columns("states")
+    A = mean[:, states]
+    told = []
+    for column in range(len(samples.signals.controls)):
+        if column in held or not mean[row, column]:
+            continue
+        if column not in laws:
+            laws[column] = follows(series, column, range(states.start, states.stop))
+        if is_feedback(laws[column], A, mean[:, column]):
+            told.append(column)
+    if not told:
+        return None
+    names = [order.names[c] for c in told]
+    return feedback_note(
+        name, series.unexplained, names, mean[row, told].tolist(), [laws[c] for c in told]
+    )
+
+
+def _unknown(
+    name: str,
+    names: Sequence[str],
+    row: Array,
+    errors: Array,
+    inputs: Array,
+    target: Array,
+    condition: float,
+) -> list[str]:
+    """Coefficients that matter and are as large as what is not known of them."""
+    if condition > CONDITION_LIMIT:  # told already: they cannot be told apart
+        return []
+    size = np.abs(row) * inputs.std(axis=0)
+    matters = (size > _MATTERS * target.std()) & (np.abs(row) < _KNOWN * errors)
+    if not matters.any():
+        return []
+    if not np.isfinite(errors[matters]).all():
+        which = ", ".join(names[i] for i in np.flatnonzero(matters).tolist())
+        return [
+            f"{name}: the runs hold fewer independent samples than the fit has coefficients, so "
+            f"nothing is known of the effects of {which}, however small the residual: give longer "
+            "or more runs"
+        ]
+    told = ", ".join(
+        f"{names[i]} ({row[i]:.3g} ± {errors[i]:.2g})" for i in np.flatnonzero(matters).tolist()
+    )
+    return [
+        f"{name}: effects that are no larger than their standard errors, {told}, may be chance "
+        "(from the correlation of what is left over): give longer or more runs, or linear.known"
+    ]
+
+
+def _noise(name: str, samples: Samples, inputs: Array, target: Array, row: Array) -> list[str]:
+    shares = noise_shares(inputs, target, samples.runs, row)
+    count = len(samples.signals.driving)
+    return [
+        f"{name}: {share:.0%} of what '{samples.linear_names[i]}' does on its own is white and has "
+        "no effect there: where it is noise of a sensor, the fit makes its effect too weak by "
+        "about that share; smooth the channel before the fit"
+        for i, share in enumerate(shares[:count])
+        if share > 0
+    ]

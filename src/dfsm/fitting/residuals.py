@@ -1,0 +1,119 @@
+"""What a linear fit of derivatives leaves over, run by run on a mesh as coarse as it allows.
+
+Diagnostics of a fit ask how its residual moves in time and with what. They need no sample that
+says nothing new: each run is averaged over equal intervals, several of which make one correlation
+time of the residual. An average of both sides of ``ξ̇ = L I + r`` is as true as the equation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dfsm.core.types import Array, IntArray
+from dfsm.numerics.least_squares import correlation_length
+
+# Intervals per correlation time of the residual, and the most of them in all runs together.
+_PER_CORRELATION = 10
+_MOST = 10_000
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """One row of a fit over the runs, averaged over equal intervals.
+
+    Attributes
+    ----------
+    step
+        Length of the intervals in s.
+    inputs, targets, left
+        What the fit takes, the derivative, and what the fit leaves of it: per run
+        ``(interval, input)`` and ``(interval,)``.
+    """
+
+    step: float
+    inputs: tuple[Array, ...]
+    targets: tuple[Array, ...]
+    left: tuple[Array, ...]
+
+    @property
+    def unexplained(self) -> float:
+        """RMS of what is left over relative to the standard deviation of the derivative."""
+        spread = float(np.concatenate(self.targets).std())
+        rms = float(np.sqrt(np.mean(np.concatenate(self.left) ** 2)))
+        return rms / max(spread, np.finfo(float).tiny)
+
+    def centred(self) -> Residuals:
+        """Every run about its own mean: what is constant in a run is none of what moves."""
+        inputs, targets, left = (
+            tuple(v - v.mean(axis=0) for v in part)
+            for part in (self.inputs, self.targets, self.left)
+        )
+        return Residuals(self.step, inputs, targets, left)
+
+
+def residuals_of(
+    time: Array, runs: IntArray, inputs: Array, target: Array, left: Array
+) -> Residuals | None:
+    """Average one row over intervals.
+
+    Parameters
+    ----------
+    time, runs
+        Of every sample, ``(sample,)``; runs one after the other.
+    inputs, target, left
+        As in `Residuals`, ``(sample, input)`` and ``(sample,)``.
+
+    Returns
+    -------
+    Residuals or None
+        None where all runs are too short to tell anything: fewer than 4 intervals per input.
+    """
+    parts = list(_split(runs))
+    step = min(float(np.median(np.diff(time[part]))) for part in parts)
+    memory = float(np.mean([_memory(time[part], left[part]) for part in parts]))
+    together = sum(float(time[part][-1] - time[part][0]) for part in parts)
+    step = max(step, memory / _PER_CORRELATION, together / _MOST)
+    table = np.column_stack([inputs, target, left])
+    means = [m for part in parts if len(m := _means(time[part], table[part], step))]
+    if sum(len(m) for m in means) < 4 * (inputs.shape[1] + 1):
+        return None
+    return Residuals(
+        step,
+        tuple(m[:, :-2] for m in means),
+        tuple(m[:, -2] for m in means),
+        tuple(m[:, -1] for m in means),
+    )
+
+
+def _split(runs: IntArray) -> Iterator[slice]:
+    ends = np.flatnonzero(np.diff(runs, append=-1)) + 1
+    for start, stop in zip([0, *ends[:-1]], ends, strict=True):
+        yield slice(start, stop)
+
+
+def _memory(time: Array, left: Array) -> float:
+    """Correlation time in s, on an equidistant mesh."""
+    even = np.linspace(time[0], time[-1], len(time))
+    return float(correlation_length(np.interp(even, time, left)[:, None])[0]) * (even[1] - even[0])
+
+
+def _means(time: Array, table: Array, step: float) -> Array:
+    """Averages over intervals of a run, ``(interval, column)``; empty ones are interpolated."""
+    count = int((time[-1] - time[0]) / step + 0.5)
+    if count < 2:
+        return np.empty((0, table.shape[1]))
+    place = np.clip(((time - time[0]) / step).astype(int), 0, count - 1)
+    filled = np.bincount(place, minlength=count)
+    sums = np.stack([np.bincount(place, column, count) for column in table.T], axis=1)
+    some = np.flatnonzero(filled)
+    means = sums[some] / filled[some, None]
+    every = np.arange(count)
+    return np.stack([np.interp(every, some, column) for column in means.T], axis=1)
+
+
+def stacked(parts: Sequence[Array]) -> Array:
+    """Runs below each other."""
+    return np.concatenate(list(parts))

@@ -1,0 +1,135 @@
+"""A verdict on every channel in words: usable, for trends only, not usable; why, and what to try.
+
+A user wants to know what a model is good for, not what its residuals are. Rollouts over recorded
+runs answer that: their error relative to what the channel does there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.fitting.doubts import Doubts
+from dfsm.fitting.samples import Samples
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.stability import Growth
+from dfsm.simulation.simulate import Simulation, Status
+
+# Error of a rollout over the standard deviation of the record. At 0.3 a curve lies on the other but
+# for detail, at 0.7 half of the variance is explained.
+USABLE, TRENDS = 0.3, 0.7
+# A channel that moves by less than this share of its overall spread in a run has no error there.
+_MOVES = 0.01
+
+
+def grade(error: float | None) -> str:
+    """The verdict on a relative error of rollouts; None is for rollouts that ended early."""
+    if error is None or not error <= TRENDS:
+        return "not usable"
+    return "usable" if error <= USABLE else "for trends only"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What verdicts rest on.
+
+    Attributes
+    ----------
+    rollouts
+        By index of the run, simulated over the time of the samples.
+    doubts
+        About the linear fit; None where it was refined since.
+    growths
+        Of the whole model.
+    refined
+        Whether rollouts taught the model.
+    """
+
+    rollouts: Mapping[int, Simulation]
+    doubts: Doubts | None
+    growths: Sequence[Growth]
+    refined: bool
+
+
+def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> list[dict[str, Any]]:
+    """Judge measured states and outputs by rollouts.
+
+    Parameters
+    ----------
+    samples
+        With the recorded states and outputs.
+    settings
+        Of the fit.
+    evidence
+        Rollouts and what else is known.
+
+    Returns
+    -------
+    list of dict
+        ``name``, ``nrmse`` (None where a rollout ended early), ``verdict`` and ``text``.
+    """
+    columns = samples.signals.observed_columns
+    states = samples.inputs[:, columns]
+    names = [c.name for c in samples.signals.states][: states.shape[1]]
+    measured = [spec.name for spec in settings.states]
+    recorded = {n: states[:, names.index(n)] for n in measured}
+    recorded |= {n: v for n, v in zip(settings.outputs, samples.outputs.T, strict=True)}
+    ended = [s for s in evidence.rollouts.values() if s.status is not Status.COMPLETED]
+    entries = []
+    for name, values in recorded.items():
+        error = None if ended else _error(name, values, samples, evidence.rollouts)
+        if error is not None and not np.isfinite(error):
+            continue
+        runs = f"{len(evidence.rollouts)} training run{'s' * (len(evidence.rollouts) > 1)}"
+        verdict = grade(error)
+        if error is None:
+            why = f"{len(ended)} of the rollouts over {runs} end early"
+        else:
+            why = f"rollouts over {runs} are off by {error:.2g} of its standard deviation"
+        text = f"{verdict}: {why}"
+        if verdict != "usable":
+            reason, advice = _advice(name, settings, evidence)
+            text = f"{verdict}, because {why}{reason}; try {advice}"
+        entries.append({"name": name, "nrmse": error, "verdict": verdict, "text": text})
+    return entries
+
+
+def _error(name: str, values: Array, samples: Samples, rollouts: Mapping[int, Simulation]) -> float:
+    """Mean over the runs of the relative error; NaN where the channel moves in none."""
+    errors = []
+    for run, rollout in rollouts.items():
+        rows = samples.runs == run
+        time, truth = samples.time[rows], values[rows]
+        weight = np.gradient(time)
+        weight /= weight.sum()
+        spread = float(np.sqrt(weight @ (truth - weight @ truth) ** 2))
+        off = np.interp(time, rollout.trajectory.time, rollout.trajectory[name]) - truth
+        if spread > _MOVES * values.std():
+            errors.append(float(np.sqrt(weight @ off**2)) / spread)
+    return float(np.mean(errors)) if errors else float("nan")
+
+
+def _advice(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, str]:
+    """Why, as far as anything tells, and what to try first."""
+    d = evidence.doubts
+    if d is not None and d.biased:
+        return (
+            f", and feedback biases {', '.join(d.biased)}",
+            "runs in which a set-point or a control is excited, or linear.known",
+        )
+    if d is not None and d.late:
+        return f", and an input acts late on {', '.join(d.late)}", "the delay that is told above"
+    unstable = any(g.unstable for g in evidence.growths)
+    if unstable and settings.linear.margin is None:
+        return ", and the model is unstable", "linear.margin, or refine"
+    if not evidence.refined and name not in settings.outputs:
+        return "", "refine, which teaches the model on rollouts"
+    if settings.linear.kind == "LTI" and settings.disturbances:
+        return "", "linear.kind LPV along the disturbance that sets the operating point"
+    if name in settings.outputs:
+        return "", "other or more disturbances that act on it, or more runs"
+    return "", "more runs, or inputs that are missing from the model"

@@ -1,0 +1,219 @@
+"""What a fit tells of its own coefficients: feedback, dead time, noise, standard errors, verdicts.
+
+Systems of one state are integrated here with the exact step, so the true coefficients are known.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from dfsm import DfsmError, DfsmWarning, Feature, FitSettings, StateSpec, Trajectory, simulate
+from dfsm.control.names import plant_of
+from dfsm.data.suspects import screened
+from dfsm.data.trajectory import Channel
+from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.fit import fit
+from dfsm.fitting.standard_errors import standard_errors
+from dfsm.fitting.verdicts import grade
+from dfsm.models.stability import Growth
+
+A, B = -0.05, 0.1
+SETTINGS = FitSettings(
+    states=(StateSpec(name="x"),),
+    controls=("u",),
+    corrective=NoCorrection(),
+    nonlinear_only=False,
+)
+
+
+def run(time, **channels):
+    names = tuple(Channel(name) for name in channels)
+    return Trajectory(time, np.stack(list(channels.values()), axis=1), names)
+
+
+def slow(rng, count, memory):
+    """Noise that two lags have smoothed, of unit variance."""
+    x = rng.standard_normal(count)
+    for lag in (memory, memory / 5):
+        a = np.exp(-1 / lag)
+        for k in range(1, count):
+            x[k] = a * x[k - 1] + (1 - a) * x[k]
+    return x / x.std()
+
+
+def plant(control, force, count, fine=10):
+    """x' = A x + B u + force; the control is a function of x, its integral and the step."""
+    x, integral, state, u = np.zeros(count), 0.0, 0.0, np.zeros(count)
+    for k in range(count):
+        x[k], u[k] = state, control(state, integral, k)
+        for j in range(fine if k < count - 1 else 0):
+            share = j / fine
+            now = control(state, integral, k + share)
+            r = force[k] * (1 - share) + force[k + 1] * share
+            integral += state / fine
+            state += (A * state + B * now + r) / fine
+    return run(np.arange(count, dtype=float), x=x, u=u)
+
+
+def told(runs, settings=SETTINGS):
+    with pytest.warns() as caught:
+        result = fit(runs, settings)
+    return result.model, [str(w.message) for w in caught if w.category is DfsmWarning]
+
+
+def quietly(runs, settings=SETTINGS):
+    """Warnings are errors in these tests."""
+    return fit(runs, settings).model
+
+
+def test_a_control_that_follows_the_state_is_not_believed():
+    force = 0.1 * slow(np.random.default_rng(0), 600, 30)
+    model, notes = told([plant(lambda x, i, _: -(1.0 * x + 0.05 * i), force, 600)])
+    assert float(model.f.coefficients[0, 0, 0]) < B / 2  # what the note is about
+    assert notes[0].startswith("x_dot: ")
+    assert "'u' (9" in notes[0]
+    assert "follows from the states" in notes[0]
+    assert "linear.known" in notes[0]
+    assert not any("set linear.margin" in note for note in notes)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.1])
+def test_an_excited_control_is_believed_whatever_is_unexplained(size):
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([-1.0, 1.0], 61), 10)
+    force = size * slow(rng, 600, 30)
+    at = np.arange(len(u))
+    quietly([plant(lambda x, i, k: np.interp(k, at, u), force, 600)])
+
+
+def delayed(seconds, count=800):
+    rng = np.random.default_rng(2)
+    time = np.arange(count, dtype=float)
+    u = slow(rng, count, 40)
+    late = np.interp(time - seconds, time, u)
+    x, decay = np.zeros(count), np.exp(A)
+    ramp = (1 + (1 - decay) / A) / -A  # the exact answer to a line from one sample to the next
+    for k in range(count - 1):
+        step = late[k + 1] - late[k]
+        x[k + 1] = decay * x[k] + B * (late[k] * (1 - decay) / -A + step * ramp)
+    return run(time, x=x, u=u)
+
+
+def test_an_input_that_acts_late_is_named_and_a_delay_mends_it():
+    data = delayed(7)
+    _, notes = told([data])
+    assert "x_dot: 'u' acts about " in notes[0]
+    assert abs(float(notes[0].split("about ")[1].split(" s")[0]) - 7) < 0.3
+    late = FitSettings(
+        states=SETTINGS.states,
+        controls=("u",),
+        features=(Feature(source="u", kind="delay", seconds=7.0),),
+        corrective=NoCorrection(),
+        nonlinear_only=False,
+    )
+    model = quietly([data], late)
+    assert_allclose(model.f.coefficients[0, 0], [0, B, A], atol=2e-3)
+    assert model.provenance.record["verdicts"][0]["verdict"] == "usable"
+    rollout = simulate(model, data)
+    assert_allclose(rollout.trajectory["x"], data["x"], atol=0.02 * data["x"].std())
+    with pytest.raises(DfsmError, match="'u_delay7' is what the control 'u' did some time ago"):
+        plant_of(model)
+
+
+def test_a_delay_needs_its_seconds():
+    with pytest.raises(DfsmError, match=r"features\.seconds"):
+        Feature(source="u", kind="delay")
+    with pytest.raises(DfsmError, match=r"features\.seconds"):
+        Feature(source="u", kind="rate", seconds=1.0)
+
+
+def test_noise_of_a_sensor_is_told_and_a_white_input_is_not():
+    rng = np.random.default_rng(3)
+    data = delayed(0)
+    noisy = run(data.time, x=data["x"], u=data["u"] + 0.5 * rng.standard_normal(len(data)))
+    model, notes = told([noisy])
+    share = 1 - float(model.f.coefficients[0, 0, 0]) / B
+    assert any("'u' does on its own is white" in note for note in notes)
+    assert share > 0.1
+    white = rng.standard_normal(400)
+    at = np.arange(400)
+    quietly([plant(lambda x, i, k: np.interp(k, at, white), np.zeros(400), 400)])
+
+
+def test_standard_errors_are_the_scatter_of_fits():
+    rng = np.random.default_rng(4)
+    slopes, errors = [], []
+    for _ in range(60):
+        x, r = slow(rng, 1000, 8)[:, None], slow(rng, 1000, 8)
+        slope = float(x[:, 0] @ r / (x[:, 0] @ x[:, 0]))
+        slopes.append(slope)
+        left = r - slope * x[:, 0]
+        errors.append(standard_errors(x, left, np.zeros(1000, dtype=int))[0])
+    assert 0.6 < np.mean(errors) / np.std(slopes) < 1.4
+
+
+def test_few_samples_leave_effects_unknown_however_small_the_residual():
+    time = np.linspace(0, 0.4, 12)  # of a period of 10 s
+    w, rng = 2 * np.pi / 10, np.random.default_rng(5)
+    q = np.cos(w * time) + 1e-4 * rng.standard_normal(12)
+    settings = FitSettings(
+        states=(StateSpec(name="q", order=2),),
+        controls=("u",),
+        corrective=NoCorrection(),
+        nonlinear_only=False,
+    )
+    model, notes = told([run(time, q=q, u=np.sin(3 * w * time))], settings)
+    assert any("chance" in note or "independent samples" in note for note in notes)
+    assert "(± " in model.summary()
+
+
+def test_an_integrator_is_called_one():
+    time = np.arange(0, 60, 0.1)
+    rate = np.sin(0.3 * time) + 0.5 * np.sin(1.1 * time)
+    x = (1 - np.cos(0.3 * time)) / 0.3 + 0.5 * (1 - np.cos(1.1 * time)) / 1.1
+    model = quietly([run(time, x=x, u=rate)])
+    text = model.summary()
+    assert "integrator" in text
+    assert "UNSTABLE" not in text
+
+
+def test_growth_is_judged_by_what_it_does():
+    assert Growth(0, 1e-9, seconds=100).word == "integrator"
+    assert Growth(0, 0.3, seconds=100).word == "UNSTABLE"
+    assert Growth(0, 0.3, seconds=100, error=0.2).word.startswith("growth within")
+    assert Growth(0, -0.3, seconds=100).word == ""
+
+
+def test_verdicts_have_words():
+    assert [grade(e) for e in (0.1, 0.5, 2.0, None)] == [
+        "usable",
+        "for trends only",
+        "not usable",
+        "not usable",
+    ]
+
+
+def test_stray_samples_and_runs_in_another_unit():
+    time = np.arange(100.0)
+    rng = np.random.default_rng(6)
+    runs = [run(time, x=5 + rng.standard_normal(100)) for _ in range(3)]
+    window = (None, None)
+    assert screened(runs, ["x"], "refuse", window) == runs
+    for value in (1e6, 1e160):
+        x = runs[0]["x"].copy()
+        x[40] = value
+        bad = [run(time, x=x), *runs[1:]]
+        with pytest.raises(DfsmError, match=r"run: 'x' is 1e\+\d+ at 40 s, far beyond"):
+            screened(bad, ["x"], "refuse", window)
+        mended = screened(bad, ["x"], "drop", window)[0]
+        assert mended["x"][40] == pytest.approx((x[39] + x[41]) / 2)
+        assert screened(bad, ["x"], "keep", window) == bad
+    mixed = [run(time, x=runs[0]["x"] * 1000), *runs[1:]]
+    with pytest.raises(DfsmError, match=r"'x' \(no unit\) is \d+ times .* \(a thousand\)"):
+        screened(mixed, ["x"], "refuse", window)
+    assert screened(mixed, ["x"], "drop", window) == mixed[1:]
+    pulse = np.zeros(100)
+    pulse[30] = 1.0
+    screened([run(time, x=pulse)], ["x"], "refuse", window)
