@@ -48,7 +48,7 @@ def print_changes(model: dfsm.DFSM, deck: dfsm.ROSCO, folder: Path) -> None:
     """What other gains do, relative to the deck's: OpenFAST, and the closed loop."""
     print("ratio to the deck's gains, OpenFAST → closed loop: " + ", ".join([*STATISTICS, "DEL"]))
     for path in sorted(folder.glob("iea15_2dofg?_*mps_s*.outb")):
-        head, letter, tail = path.stem.partition("2dofg")[0], path.stem[10], path.stem[12:]
+        head, letter, tail = path.stem.partition("2dofg")[0], path.stem[11], path.stem[13:]
         base = dfsm.read(demo.DATA / f"{head}2dof_{tail}.parquet")
         (run,) = with_rings([base])
         laws = {"deck": deck, "changed": changed(deck, letter)}

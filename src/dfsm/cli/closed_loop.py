@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -95,7 +96,8 @@ def closed_loop(
     if as_json:
         print_json(validation.to_dict())
     elif not quiet:
-        print_article(article)
+        # The page tells each run.
+        print_article(replace(article, sections=article.sections[:1]))
         if kept := [n for n in surrogate.signals.names("controls") if n not in law.commands]:
             say(f"the controller does not set {', '.join(kept)}: as recorded", quiet)
         say(f"wrote {output} ({len(runs)} runs) and {figures}", quiet)
@@ -140,7 +142,7 @@ def _controller(text: str, library: Path | None, interval: float | None) -> Cont
         return BladedLibrary(library, Path(text), interval=interval)
     from dfsm.controllers.rosco import read_rosco
 
-    return read_rosco(text, interval=interval)
+    return read_rosco(text, interval=interval)  # pyright: ignore[reportReturnType]
 
 
 def _own(path: Path, name: str) -> Controller:

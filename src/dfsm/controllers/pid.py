@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dfsm.controllers.rosco_blocks import lookup, within
+from dfsm.controllers.rosco_blocks import lookup, unwound, within
 from dfsm.controllers.traced import traced
 from dfsm.core.settings import require
 
@@ -25,7 +25,7 @@ class PID(eqx.Module):
     """A `Controller` of one command by one measurement: u = kp e + ki ∫e dt - kd dy/dt.
 
     e is the setpoint less the measurement y; the integral takes the error of its own step (backward
-    Euler). At a limit the integral waits unless the error leads away from the limit, so that
+    Euler). It takes the command up to a limit and waits there unless the error leads away, so that
     nothing winds up, and it stays within the limits itself.
 
     Attributes
@@ -113,11 +113,7 @@ class PID(eqx.Module):
         smooth = state.smooth + dt * slope
         moved = within(state.integral + dt * ki * error, *self.limits)
         direct = kp * error - kd * slope
-        wanted = direct + moved
-        low, high = self.limits
-        # Integrating further would lead the command farther beyond its limit.
-        waits = ((wanted > high) & (ki * error > 0)) | ((wanted < low) & (ki * error < 0))
-        integral = jnp.where(waits, state.integral, moved)
+        integral = unwound(state.integral, moved, direct, self.limits)
         return PIDState(integral, smooth), within(direct + integral, *self.limits)[None]
 
     def _gain(self, gain: jax.Array, measurements: jax.Array) -> jax.Array:

@@ -127,6 +127,31 @@ def proportional_integral(
     return integral, within(proportional * error + integral, *limits)
 
 
+def unwound(
+    integral: jax.Array,
+    moved: jax.Array,
+    direct: jax.Array,
+    limits: tuple[jax.Array | float, jax.Array | float],
+) -> jax.Array:
+    """Next integral, which takes ``direct + integral`` up to a limit and no farther.
+
+    Parameters
+    ----------
+    integral, moved
+        Before and after the step.
+    direct
+        What else makes the command.
+    limits
+        Lowest and highest command.
+    """
+    low, high = limits
+    wanted, by = direct + moved, moved - integral
+    waits = ((wanted > high) & (by > 0)) | ((wanted < low) & (by < 0))
+    reached = within(wanted, low, high) - direct
+    between = within(reached, jnp.minimum(integral, moved), jnp.maximum(integral, moved))
+    return jnp.where(waits, between, moved)
+
+
 def lookup(points: jax.Array, values: jax.Array, at: jax.Array) -> jax.Array:
     """Linear between the points, constant beyond them."""
     return hats(points, at) @ values

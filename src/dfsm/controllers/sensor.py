@@ -18,7 +18,7 @@ class SensorState(NamedTuple):
 
     inner: Any
     recent: jax.Array
-    steps: jax.Array
+    calls: jax.Array
 
 
 class Sensor(eqx.Module):
@@ -104,11 +104,11 @@ class Sensor(eqx.Module):
         first = int(steps * (1 + 1e-9))
         part = min(max(steps - first, 0.0), 1.0)
         late = (1 - part) * recent[first] + part * recent[first + 1]
-        key = jax.random.fold_in(jax.random.key(self.seed), state.steps)
+        key = jax.random.fold_in(jax.random.key(self.seed), state.calls)
         late = late + self.noise * jax.random.normal(key, late.shape)
         told = jnp.asarray(measurements).at[self._columns].set(late)
         inner, commands = self.inner.step(state.inner, told, time)
-        return SensorState(inner, recent, state.steps + 1), commands
+        return SensorState(inner, recent, state.calls + 1), commands
 
     @property
     def _columns(self) -> Any:

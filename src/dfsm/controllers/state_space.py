@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError, solve_discrete_are
-from scipy.signal import cont2discrete
+from scipy.linalg import LinAlgError, expm, solve_discrete_are
 
-from dfsm.controllers.rosco_blocks import within
+from dfsm.controllers.rosco_blocks import unwound, within
 from dfsm.core.settings import require
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
@@ -147,10 +146,7 @@ class StateFeedback(eqx.Module):
         if self.integral_gain is None:
             return state, within(wanted, *self.limits)
         by = -self.interval * self.integral_gain @ error
-        low, high = self.limits
-        unlimited = wanted + state + by
-        waits = ((unlimited > high) & (by > 0)) | ((unlimited < low) & (by < 0))
-        state = jnp.where(waits, state, state + by)
+        state = unwound(state, state + by, wanted, self.limits)
         return state, within(wanted + state, *self.limits)
 
 
@@ -179,15 +175,16 @@ def regulator_gain(
         There is no such gain: a part that does not decay cannot be reached by the controls or is
         not weighted.
     """
-    A, B, Q, R = (np.asarray(a, dtype=float) for a in (A, B, Q, R))
-    none = np.zeros((1, len(A)))
-    discrete: Any = cont2discrete((A, B, none, np.zeros((1, B.shape[1]))), interval)
-    Ad, Bd = discrete[:2]
+    F, G, q, r = (np.asarray(a, dtype=float) for a in (A, B, Q, R))
+    n, m = G.shape
+    # With the controls among the states, which hold.
+    moves = expm(np.block([[F, G], [np.zeros((m, n + m))]]) * interval)
+    Ad, Bd = moves[:n, :n], moves[:n, n:]
     try:
-        P = solve_discrete_are(Ad, Bd, Q, R)
+        P = solve_discrete_are(Ad, Bd, q, r)
     except (LinAlgError, ValueError) as error:
         raise DfsmError(
             f"there is no linear-quadratic regulator ({error}): weight every state that does not "
             "decay by itself, and leave out those that the controls do not reach"
         ) from None
-    return np.linalg.solve(R + Bd.T @ P @ Bd, Bd.T @ P @ Ad)
+    return np.linalg.solve(r + Bd.T @ P @ Bd, Bd.T @ P @ Ad)

@@ -13,8 +13,8 @@ from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
 from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
+from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.signals import with_computed
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loops
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 
@@ -186,7 +186,7 @@ def sweep(
     named = [n for n in (settings.power, settings.speed) if n is not None]
     if lost := [n for n in named if n not in units]:
         raise DfsmError(f"settings: the model has {missing(lost, units)}")
-    runs = [with_computed(run, s.hub_height, s.features) for run in runs]
+    runs = [completed(run, s) for run in runs]
     with hushed():
         rolled = closed_loops(
             model,

@@ -34,8 +34,9 @@ def closed_loop_article(validation: ClosedLoopValidation, model: str, controller
             "figures",
             "Closed loop against the record",
             (done, *validation.endings()),
-            (_over_runs(validation), _by_run(validation)),
-        )
+            (_over_runs(validation),),
+        ),
+        Section("runs", "Each run", tables=(_by_run(validation),)),
     ]
     for run in validation.runs:
         if run.loop_statistics:

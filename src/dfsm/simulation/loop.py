@@ -98,7 +98,7 @@ def roll(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
         return values.reshape(calls, per_call, -1)
 
     v = drive.inputs
-    legs = tuple(by_call(part) for part in (v[:-2:2], v[1::2], v[2::2]))
+    legs = tuple(by_call(part) for part in wires.along(v))
     fields = drive.field[:-1:per_call]
     seen = wires.measured(model, drive.x0, v[0], (drive.psi0, drive.field[0]))
     begun = _plain(controller.start(seen, wires.commands_of(v[0])))
@@ -212,18 +212,19 @@ class HostLoop:
 
         # Not `filter_jit`, whose own work would be most of a call's time.
         @jax.jit
-        def seen(arrays: Any, x: jax.Array, v: jax.Array, blades: Any) -> jax.Array:
+        def seen(arrays: Any, x: Any, v: Any, blades: Any) -> jax.Array:
             return wires.measured(eqx.combine(arrays, rest), x, jnp.asarray(v), blades)
 
         @jax.jit
-        def on(arrays: Any, x: jax.Array, psi: jax.Array, h: jax.Array, legs: Any) -> Any:
+        def on(arrays: Any, x: Any, psi: Any, h: Any, legs: Any) -> Any:
             model, v, commands, field = eqx.combine(arrays, rest), *legs
-            driven = wires.with_commands(jnp.asarray(v), wires.in_model_units(commands))
+            told, v = wires.in_model_units(commands), jnp.asarray(v)
             path = []
-            for leg in range((len(v) - 1) // 2):
-                x, psi = _plant_step(model, x, psi, h, tuple(driven[2 * leg + i] for i in range(3)))
+            for parts in zip(*wires.along(v), strict=True):
+                ends = tuple(wires.with_commands(part, told) for part in parts)
+                x, psi = _plant_step(model, x, psi, h, ends)
                 path.append(x)
-            now = wires.measured(model, x, driven[-1], (psi, jnp.asarray(field)))
+            now = wires.measured(model, x, wires.with_commands(v[-1], told), (psi, field))
             return jnp.stack(path), psi, now
 
         self._seen = partial(seen, arrays)

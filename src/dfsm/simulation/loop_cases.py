@@ -8,9 +8,11 @@ from fractions import Fraction
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
+from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed
@@ -140,8 +142,8 @@ def _case(
         psi0=initial_azimuth(model, run, begins),  # pyright: ignore[reportArgumentType]
         time=begins + interval * np.arange(calls),  # pyright: ignore[reportArgumentType]
         h=np.full(calls, h),  # pyright: ignore[reportArgumentType]
-        inputs=_interpolated(driven, mesh),  # pyright: ignore[reportArgumentType]
-        field=_interpolated(fields, mesh[::2]),  # pyright: ignore[reportArgumentType]
+        inputs=_interpolated(driven, mesh, s.between_samples()),  # pyright: ignore[reportArgumentType]
+        field=_interpolated(fields, mesh[::2], ["linear"] * len(fields.channels)),  # pyright: ignore[reportArgumentType]
     )
     inside = part.time <= mesh[-1] + 1e-6 * h
     part = replace(part, time=part.time[inside], values=part.values[inside])
@@ -157,10 +159,20 @@ def _steps_per_call(interval: float, sampling: float, step: float | None) -> int
     return parts * max(1, int(np.ceil(interval / parts / longest * (1 - 1e-9))))
 
 
-def _interpolated(run: Trajectory, mesh: Array) -> Array:
-    if not run.channels:
-        return np.zeros((len(mesh), 0))
-    return np.stack([np.interp(mesh, run.time, column) for column in run.values.T], axis=1)
+def _interpolated(run: Trajectory, mesh: Array, kinds: Sequence[Between]) -> Array:
+    """Channels at any times, ``(time, channel)``, by what each does between samples."""
+    inputs = np.zeros((len(mesh), len(run.channels)))
+    # A mesh point that rounding puts before its sample has the sample's value.
+    before = np.searchsorted(run.time, mesh + 1e-9 * run.duration, side="right") - 1
+    for i, kind in enumerate(kinds):
+        values = run.values[:, i]
+        if kind == "hold":
+            inputs[:, i] = values[before]
+        elif kind == "cubic":
+            inputs[:, i] = CubicSpline(run.time, values)(mesh)
+        else:
+            inputs[:, i] = np.interp(mesh, run.time, values)
+    return inputs
 
 
 def padded(case: LoopCase, calls: int) -> Drive:

@@ -13,6 +13,7 @@ from dfsm.core.units import agree, factor
 from dfsm.data.derivatives import per_second
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.dfsm import DFSM
+from dfsm.simulation.integrate import Stages, stages
 
 _RATE = "_dot"
 
@@ -31,12 +32,15 @@ class Wires:
         Column of the control that each command sets.
     command_factors
         What one unit of the controller is in the model's unit, per command.
+    held
+        Which exogenous inputs keep the value of a sample until the next.
     """
 
     sources: tuple[tuple[str, int], ...]
     factors: tuple[float, ...]
     commanded: tuple[int, ...]
     command_factors: tuple[float, ...]
+    held: tuple[bool, ...]
 
     @property
     def reads_outputs(self) -> bool:
@@ -89,6 +93,10 @@ class Wires:
         ]
         return jnp.concatenate([jnp.stack(columns, axis=-1), exogenous[..., last:]], axis=-1)
 
+    def along(self, inputs: jax.Array) -> Stages:
+        """Inputs at start, middle and end of every step, see `stages`."""
+        return stages(inputs, np.array(self.held) if any(self.held) else None)
+
     def in_model_units(self, commands: jax.Array) -> jax.Array:
         """Commands ``(..., command)`` of the controller in the model's units."""
         return commands * jnp.array(self.command_factors)
@@ -140,7 +148,8 @@ def connect(
             )
         commanded.append(names.index(name))
         command_factors.append(1 / _factor(name, controls[commanded[-1]].unit, unit))
-    return Wires(tuple(sources), tuple(factors), tuple(commanded), tuple(command_factors))
+    held = tuple(kind == "hold" for kind in model.signals.between_samples())
+    return Wires(tuple(sources), tuple(factors), tuple(commanded), tuple(command_factors), held)
 
 
 def not_commanded(model: DFSM, controller: Controller) -> list[str]:
@@ -181,10 +190,10 @@ def _factor(name: str, source: str, target: str) -> float:
     """What one unit `source` is in `target`."""
     if agree(source, target):
         return 1.0
-    size = factor(source, target)
-    if size is not None:
-        return size
-    raise DfsmError(
-        f"'{name}' is in '{source}' in the model and in '{target}' in the controller, which do not "
-        "convert into each other: change one of them"
-    )
+    found = factor(source, target)
+    if found is None:
+        raise DfsmError(
+            f"'{name}' is in '{source}' in the model and in '{target}' in the controller, which do "
+            "not convert into each other: change one of them"
+        )
+    return found

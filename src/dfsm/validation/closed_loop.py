@@ -15,16 +15,16 @@ import numpy as np
 
 from dfsm.controllers.controller import Controller
 from dfsm.core.files import json_value
-from dfsm.data.derivatives import differentiate, lead_in
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import hushed
 from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
+from dfsm.models.recorded import recorded_states
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 from dfsm.simulation.simulate import Simulation, Status, simulate
 from dfsm.validation.results import ChannelError, ChannelStatistics
-from dfsm.validation.validate import all_statistics, frequency_bands, recorded_signals
+from dfsm.validation.validate import all_statistics, frequency_bands, recorded_channels
 
 # Wöhler exponent of the one damage-equivalent load in tables.
 SHOWN_EXPONENT = "4"
@@ -215,9 +215,8 @@ def _compare(
     first = float(loop.trajectory.time[0]) if done else window[0]
     last = float(loop.trajectory.time[-1]) if done else window[1]
     part = run.window(first, last)
-    head = lead_in(run, first, s.derivatives)
-    rates = differentiate(head, s.specs, s.derivatives).trajectory.window(first, last)
-    recorded = recorded_signals(model, part, rates)
+    rates = recorded_states(model, run, first).trajectory.window(first, last)
+    recorded = recorded_channels(model, part, rates)
     recorded = recorded.with_channels(s.controls, part.select(s.names("controls")).values)
     with hushed():
         replay = simulate(model, run, start=first, stop=last)

@@ -154,7 +154,7 @@ def _compare(
     s = first.signals
     seen = recorded_states(first, run, window[0])
     inside = seen.trajectory.window(*window)
-    recorded = recorded_signals(first, run.window(*window), inside)
+    recorded = recorded_channels(first, run.window(*window), inside)
     bands = frequency_bands(first, recorded)
     weights = weights_over_time([recorded.time])
     usual = training_spreads(first)
@@ -202,7 +202,7 @@ def _simulate_warm(
         return simulate(model, run, start=window[0], stop=window[1], settings=settings)
 
 
-def recorded_signals(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
+def recorded_channels(model: DFSM, run: Trajectory, differentiated: Trajectory) -> Trajectory:
     """States and outputs to compare with: measured ones as recorded, rates as extracted."""
     channels = (*model.signals.observed, *model.signals.outputs)
     names = [c.name for c in channels]
