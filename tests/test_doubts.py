@@ -8,12 +8,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
 
 from dfsm import DfsmError, DfsmWarning, Feature, FitSettings, StateSpec, Trajectory, simulate
 from dfsm.control.names import plant_of
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel
 from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.feedback import Law, is_feedback
 from dfsm.fitting.fit import fit
 from dfsm.fitting.standard_errors import standard_errors
 from dfsm.fitting.verdicts import grade
@@ -217,3 +219,35 @@ def test_stray_samples_and_runs_in_another_unit():
     pulse = np.zeros(100)
     pulse[30] = 1.0
     screened([run(time, x=pulse)], ["x"], "refuse", window)
+
+
+def test_feedback_may_take_an_effect_away_and_turn_its_sign():
+    A_open, b, gain = np.array([[0.0, 1.0], [-0.4, 0.0]]), np.array([0.0, -0.016]), [-0.67, -0.97]
+    law = Law(0.99, np.array(gain))
+    assert is_feedback(law, A_open, b, known=False)
+    assert not is_feedback(law, A_open, b, known=True)  # a state that follows its control
+    assert not is_feedback(Law(0.5, law.gain), A_open, b, known=False)
+
+
+def test_standard_errors_are_those_of_the_time_on_bunched_meshes():
+    even = np.linspace(0, 100, 1001)
+    bunched = np.unique(np.concatenate([even, np.linspace(50, 50.05, 1000)]))
+    errors = []
+    for time in (even, bunched):
+        u = np.sin(0.9 * time) + np.sin(0.37 * time)
+        x = solve_ivp(
+            lambda t, x: -0.5 * x + np.sin(0.9 * t) + np.sin(0.37 * t) + 0.05 * np.sin(2.1 * t + 1),
+            (0, 100), [1.0], t_eval=time, rtol=1e-9, atol=1e-10, max_step=0.1,
+        ).y[0]  # fmt: skip
+        row = quietly([run(time, x=x, u=u)]).provenance.record["rows"][0]
+        errors.append([error for *_, error in row["coefficients"]])
+    assert_allclose(errors[1], errors[0], rtol=0.3)
+
+
+def test_runs_in_two_units_are_told_of_their_units_first():
+    time = np.arange(100.0)
+    runs = [
+        Trajectory(time, np.sin(time + k)[:, None] * scale, (Channel("x", unit),))
+        for k, (scale, unit) in enumerate([(1e3, "N"), (1.0, "kN"), (1.0, "kN")])
+    ]
+    assert len(screened(runs, ["x"], "refuse", (None, None))) == 3

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from dfsm.core.types import Array, IntArray
+from dfsm.core.units import agree
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 
@@ -67,6 +68,9 @@ def screened(
     for name in names:
         if not all(name in run for run in kept):
             continue
+        units = [run.channel(name).unit for run in kept]
+        if not all(agree(units[0], unit) for unit in units):
+            continue  # which is said of the runs' units, and needs no guess
         odd = _other_unit([run.window(*window) for run in kept], name)
         if odd is None:
             continue
