@@ -17,9 +17,9 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, missing
 from dfsm.numerics.time_mesh import own_interval
 
-Between = Literal["hold", "linear"]
+Way = Literal["hold", "linear"]
 # What one channel does, or each of several.
-Slower = Between | Mapping[str, Between] | None
+Slower = Way | Mapping[str, Way] | None
 
 
 def fill_slower(run: Trajectory, between: Slower) -> Trajectory:
@@ -76,7 +76,7 @@ def fill_slower(run: Trajectory, between: Slower) -> Trajectory:
     return filled.window(start, stop)
 
 
-def _filled(time: Array, mesh: Array, samples: Array, way: Between) -> Array:
+def _filled(time: Array, mesh: Array, samples: Array, way: Way) -> Array:
     if way == "linear":
         return np.interp(time, mesh, samples)
     return samples[np.maximum(np.searchsorted(mesh, time, side="right") - 1, 0)]
