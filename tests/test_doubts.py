@@ -5,6 +5,8 @@ Systems of one state are integrated here with the exact step, so the true coeffi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -120,6 +122,9 @@ def test_an_input_that_acts_late_is_named_and_a_delay_mends_it():
     assert model.provenance.record["verdicts"][0]["verdict"] == "usable"
     rollout = simulate(model, data)
     assert_allclose(rollout.trajectory["x"], data["x"], atol=0.02 * data["x"].std())
+    # A record that starts later does not hold what acts on its first seconds.
+    model = fit([data.window(100)], late).model
+    assert_allclose(model.f.coefficients[0, 0], [0, B, A], atol=2e-3)
     with pytest.raises(DfsmError, match="'u_delay7' is what the control 'u' did some time ago"):
         plant_of(model)
 
@@ -251,3 +256,17 @@ def test_runs_in_two_units_are_told_of_their_units_first():
         for k, (scale, unit) in enumerate([(1e3, "N"), (1.0, "kN"), (1.0, "kN")])
     ]
     assert len(screened(runs, ["x"], "refuse", (None, None))) == 3
+
+
+def test_a_state_that_is_held_in_its_file_is_told_and_joined_where_named():
+    time = np.arange(0, 200, 0.2)
+    u = np.sin(0.4 * time) + np.sin(0.15 * time)
+    # x' = -0.5 x + u, its answer to each sine
+    x = sum((0.5 * np.sin(w * time) - w * np.cos(w * time)) / (0.25 + w**2) for w in (0.4, 0.15))
+    staircase = run(time, x=x[np.arange(len(time)) // 5 * 5], u=u)
+    model, notes = told([staircase])
+    assert "'x' changes every 1 s only" in notes[0]
+    assert "data.slower: {x: linear}" in notes[0]
+    assert float(model.f.coefficients[0, 0, 1]) > -0.45
+    joined = fit([staircase], replace(SETTINGS, slower={"x": "linear"})).model
+    assert_allclose(joined.f.coefficients[0, 0], [1, -0.5], rtol=0.05)

@@ -90,7 +90,7 @@ def _without_strays(run: Trajectory, names: Sequence[str], what: Suspects) -> Tr
     values: Array | None = None
     for name in names:
         samples = run[name]
-        strays = _strays(samples)
+        strays = stray_rows(samples)
         if not len(strays):
             continue
         if what == "refuse" or len(strays) > _FEW:
@@ -108,7 +108,7 @@ def _without_strays(run: Trajectory, names: Sequence[str], what: Suspects) -> Tr
     return run if values is None else replace(run, values=values)
 
 
-def _strays(samples: Array) -> IntArray:
+def stray_rows(samples: Array) -> IntArray:
     """Rows of the samples that are huge, or a few that are far from all others."""
     finite = np.isfinite(samples)
     huge = np.flatnonzero(finite & (np.abs(np.where(finite, samples, 0.0)) > _HUGE))
@@ -119,7 +119,8 @@ def _strays(samples: Array) -> IntArray:
         return huge
     middle = float(np.median(good))
     off = np.where(finite, np.abs(np.where(finite, samples, middle) - middle), 0.0)
-    order = np.argsort(-off, kind="stable")[: _FEW + 1]
+    order = np.argpartition(-off, _FEW)[: _FEW + 1]
+    order = order[np.argsort(-off[order], kind="stable")]
     far = off[order]
     for count in range(1, _FEW + 1):
         if far[count] > 0 and far[count - 1] > _STRAY * far[count]:
