@@ -118,6 +118,13 @@ def test_standard_output_on_a_full_disk(here):
     assert re.fullmatch(r"error: standard output .*No space left on device.*\n", done.stderr)
 
 
+def test_the_package_runs_as_a_module(here):
+    done = subprocess.run(
+        [sys.executable, "-m", "dfsm", "info", "train/a.csv"], capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_a_terminal_without_unicode_gets_escapes(here):
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(

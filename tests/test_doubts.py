@@ -5,9 +5,12 @@ Systems of one state are integrated here with the exact step, so the true coeffi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
 
 from dfsm import (
     DerivativeSettings,
@@ -23,6 +26,7 @@ from dfsm.control.names import plant_of
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel
 from dfsm.fitting.corrective import NoCorrection
+from dfsm.fitting.feedback import Law, is_feedback
 from dfsm.fitting.fit import fit
 from dfsm.fitting.standard_errors import standard_errors
 from dfsm.fitting.verdicts import grade
@@ -127,6 +131,9 @@ def test_an_input_that_acts_late_is_named_and_a_delay_mends_it():
     assert model.provenance.record["verdicts"][0]["verdict"] == "usable"
     rollout = simulate(model, data)
     assert_allclose(rollout.trajectory["x"], data["x"], atol=0.02 * data["x"].std())
+    # A record that starts later does not hold what acts on its first seconds.
+    model = fit([data.window(100)], late).model
+    assert_allclose(model.f.coefficients[0, 0], [0, B, A], atol=2e-3)
     with pytest.raises(DfsmError, match="'u_delay7' is what the control 'u' did some time ago"):
         plant_of(model)
 
@@ -226,3 +233,49 @@ def test_stray_samples_and_runs_in_another_unit():
     pulse = np.zeros(100)
     pulse[30] = 1.0
     screened([run(time, x=pulse)], ["x"], "refuse", window, DerivativeSettings())
+
+
+def test_feedback_may_take_an_effect_away_and_turn_its_sign():
+    A_open, b, gain = np.array([[0.0, 1.0], [-0.4, 0.0]]), np.array([0.0, -0.016]), [-0.67, -0.97]
+    law = Law(0.99, np.array(gain))
+    assert is_feedback(law, A_open, b, known=False)
+    assert not is_feedback(law, A_open, b, known=True)  # a state that follows its control
+    assert not is_feedback(Law(0.5, law.gain), A_open, b, known=False)
+
+
+def test_standard_errors_are_those_of_the_time_on_bunched_meshes():
+    even = np.linspace(0, 100, 1001)
+    bunched = np.unique(np.concatenate([even, np.linspace(50, 50.05, 1000)]))
+    errors = []
+    for time in (even, bunched):
+        u = np.sin(0.9 * time) + np.sin(0.37 * time)
+        x = solve_ivp(
+            lambda t, x: -0.5 * x + np.sin(0.9 * t) + np.sin(0.37 * t) + 0.05 * np.sin(2.1 * t + 1),
+            (0, 100), [1.0], t_eval=time, rtol=1e-9, atol=1e-10, max_step=0.1,
+        ).y[0]  # fmt: skip
+        row = quietly([run(time, x=x, u=u)]).provenance.record["rows"][0]
+        errors.append([error for *_, error in row["coefficients"]])
+    assert_allclose(errors[1], errors[0], rtol=0.3)
+
+
+def test_runs_in_two_units_are_told_of_their_units_first():
+    time = np.arange(100.0)
+    runs = [
+        Trajectory(time, np.sin(time + k)[:, None] * scale, (Channel("x", unit),))
+        for k, (scale, unit) in enumerate([(1e3, "N"), (1.0, "kN"), (1.0, "kN")])
+    ]
+    assert len(screened(runs, ["x"], "refuse", (None, None), DerivativeSettings())) == 3
+
+
+def test_a_state_that_is_held_in_its_file_is_told_and_joined_where_named():
+    time = np.arange(0, 200, 0.2)
+    u = np.sin(0.4 * time) + np.sin(0.15 * time)
+    # x' = -0.5 x + u, its answer to each sine
+    x = sum((0.5 * np.sin(w * time) - w * np.cos(w * time)) / (0.25 + w**2) for w in (0.4, 0.15))
+    staircase = run(time, x=x[np.arange(len(time)) // 5 * 5], u=u)
+    model, notes = told([staircase])
+    assert "'x' changes every 1 s only" in notes[0]
+    assert "data.slower: {x: linear}" in notes[0]
+    assert float(model.f.coefficients[0, 0, 1]) > -0.45
+    joined = fit([staircase], replace(SETTINGS, slower={"x": "linear"})).model
+    assert_allclose(joined.f.coefficients[0, 0], [1, -0.5], rtol=0.05)

@@ -102,3 +102,11 @@ def test_a_long_run_is_described_part_by_part(monkeypatch):
     for one, other in zip(at_once.channels, in_parts.channels, strict=True):
         figures = [(c.min, c.max, c.mean, c.std) for c in (one, other)]
         np.testing.assert_allclose(*figures, rtol=1e-12, equal_nan=True)
+
+
+def test_a_sample_far_beyond_all_others_is_told():
+    values = np.sin(np.arange(100.0))
+    values[70] = 1e160
+    run = Trajectory(np.arange(100.0), values[:, None], (Channel("x"),))
+    (warning,) = describe(run).warnings
+    assert warning.startswith("'x' is 1e+160 at 70 s, far beyond")

@@ -197,3 +197,9 @@ def python(code: str) -> str:
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
     )
     return done.stdout.strip()
+
+
+def test_runs_have_their_earlier_address_too():
+    from dfsm.trajectory import Channel, Trajectory
+
+    assert (Channel, Trajectory) == (dfsm.Channel, dfsm.Trajectory)

@@ -442,8 +442,7 @@ def test_the_command_line_refines(here, dfsm):
         assert "the error of rollouts over those held out (" in " ".join(result.out.split())
     else:
         assert "refinement did not lower the error" in result.err
-    content["refine"]["windows"] = [-1.0]
-    write_config(Path("c.yaml"), content)
+    write_config(Path("c.yaml"), content | {"refine": content["refine"] | {"windows": [-1.0]}})
     refused = dfsm("fit", "c.yaml", "-o", "other")
     assert refused.code == 2
     assert "refine.windows is -1.0" in refused.err

@@ -121,6 +121,15 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
     return run
 
 
+def unknown_until(features: Iterable[Feature]) -> float:
+    """Seconds from the start of a record in which a delay asks for what was before it."""
+    late: dict[str, float] = {}
+    for feature in features:
+        before = max(late.get(source, 0.0) for source in feature.sources)
+        late[feature.name] = before + (feature.seconds or 0.0)
+    return max(late.values(), default=0.0)
+
+
 def acting_late(features: Iterable[Feature], controls: Iterable[str]) -> dict[str, str]:
     """Features that hold what a control did before, each with that control.
 

@@ -14,6 +14,7 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrapping
 from dfsm.data.slower import slower_warning
+from dfsm.data.suspects import stray_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
@@ -106,6 +107,11 @@ def describe(trajectory: Trajectory) -> RunInfo:
     RunInfo
         Times in s, the rest in the channels' units.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # squares of strays, which are told
+        return _described(trajectory)
+
+
+def _described(trajectory: Trajectory) -> RunInfo:
     steps = np.diff(trajectory.time)
     return RunInfo(
         name=trajectory.name,
@@ -127,22 +133,18 @@ def describe(trajectory: Trajectory) -> RunInfo:
 
 def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
     finite = np.isfinite(values)
-    if len(values) > _BLOCK and finite.all() and weights_over_time([time]) is None:
+    # On an equidistant mesh a sample stands for a step, whatever is missing beside it.
+    apart = len(time) > 1 and weights_over_time([time]) is not None
+    if len(values) > _BLOCK and finite.all() and not apart:
         return _long_channel_info(channel, values)
-    good, time = values[finite], time[finite]
-    weights = weights_over_time([time]) if len(time) > 1 else None
+    good = values[finite]
+    weights = weights_over_time([time[finite]]) if apart and len(good) > 1 else None
     if not len(good):
         nan = math.nan
         return ChannelInfo(channel.name, channel.unit, nan, nan, nan, nan, channel.step)
-    return ChannelInfo(
-        channel.name,
-        channel.unit,
-        float(good.min()),
-        float(good.max()),
-        float(mean_over(good, weights)),
-        float(std_over(good, weights)),
-        channel.step,
-    )
+    mean, std = float(mean_over(good, weights)), float(std_over(good, weights))
+    least, most = float(good.min()), float(good.max())
+    return ChannelInfo(channel.name, channel.unit, least, most, mean, std, channel.step)
 
 
 # Samples of a channel that are looked at together: a long run is not copied for its statistics.
@@ -231,6 +233,13 @@ def _warnings(trajectory: Trajectory) -> list[str]:
 def _looks(run: Trajectory, name: str) -> list[str]:
     """What a channel is, from its name and its samples."""
     sentences, unit = [], run.channel(name).unit
+    if len(strays := stray_rows(run[name])):
+        first = strays[0]
+        more = f" (and {len(strays) - 1} more)" if len(strays) > 1 else ""
+        sentences.append(
+            f"'{name}' is {run[name][first]:.4g} at {run.time[first]:g} s{more}, far beyond all "
+            "its other samples: correct it, or set data.outliers to drop"
+        )
     if wrap := wrapping(run.time, run[name], unit):
         sentences.append(
             f"'{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''}, {wrap.times} times, "
@@ -344,4 +353,6 @@ def merged(runs: Sequence[RunInfo]) -> list[MergedChannel]:
 
 
 def _without_nan(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
+    return {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()
+    }

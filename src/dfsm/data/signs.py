@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 
 _PERIODS = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0, "rad": 2 * np.pi}
 # Fewer samples than this show nothing.
@@ -67,9 +68,28 @@ def held_interval(time: Array, values: Array) -> float | None:
     float or None
         None where it changes at every sample, or at no regular ones.
     """
+    every = _held(values)
+    return None if every is None else float(np.median(np.diff(time[_changes(values)])))
+
+
+def moments(values: Array) -> NDArray[np.bool_]:
+    """Samples at which a held channel was recorded, ``(time,)``; all of one that is not held."""
+    recorded, every = np.ones(len(values), dtype=bool), _held(values)
+    if every is not None:
+        recorded[:] = False
+        recorded[(_changes(values)[0] + 1) % every :: every] = True
+    return recorded
+
+
+def _changes(values: Array) -> IntArray:
+    return np.flatnonzero(np.diff(values) != 0)
+
+
+def _held(values: Array) -> int | None:
+    """Samples from one change to the next; None where these are not regular."""
     if len(values) < _FEWEST or not np.isfinite(values).all():
         return None
-    changes = np.flatnonzero(np.diff(values) != 0)
+    changes = _changes(values)
     if len(changes) < _CHANGES or len(changes) > 0.6 * len(values):
         return None
     apart = np.diff(changes)
@@ -77,7 +97,7 @@ def held_interval(time: Array, values: Array) -> float | None:
     # A value that happens to be the same twice makes a gap of twice the length.
     if usual < 2 or np.mean(apart == usual) < _REGULAR or (apart % usual).any():
         return None
-    return float(np.median(np.diff(time[changes])))
+    return usual
 
 
 def jumps_at_first(values: Array) -> bool:

@@ -13,13 +13,14 @@ from typing import Literal
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.data.signs import moments
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, missing
 from dfsm.numerics.time_mesh import own_interval
 
-Between = Literal["hold", "linear"]
+Way = Literal["hold", "linear"]
 # What one channel does, or each of several.
-Slower = Between | Mapping[str, Between] | None
+Slower = Way | Mapping[str, Way] | None
 
 
 def fill_slower(run: Trajectory, between: Slower) -> Trajectory:
@@ -31,7 +32,8 @@ def fill_slower(run: Trajectory, between: Slower) -> Trajectory:
         Any run.
     between
         What such channels do between their samples, ``"hold"`` or ``"linear"``: all of them, or
-        by name. None leaves the run as it is.
+        by name. None leaves the run as it is. A channel named ``"linear"`` that the file holds
+        from sample to sample at a regular interval counts as one that is empty in between.
 
     Returns
     -------
@@ -56,6 +58,8 @@ def fill_slower(run: Trajectory, between: Slower) -> Trajectory:
             raise DfsmError(f"slower is '{way}' for '{name}', expected hold or linear")
         column = run.column(name)
         present = np.isfinite(values[:, column])
+        if way == "linear" and not isinstance(between, str) and present.all():
+            present = moments(values[:, column])
         interval = own_interval(run.time, present)
         if interval is None:
             if not isinstance(between, str) and not present.all():
@@ -76,7 +80,7 @@ def fill_slower(run: Trajectory, between: Slower) -> Trajectory:
     return filled.window(start, stop)
 
 
-def _filled(time: Array, mesh: Array, samples: Array, way: Between) -> Array:
+def _filled(time: Array, mesh: Array, samples: Array, way: Way) -> Array:
     if way == "linear":
         return np.interp(time, mesh, samples)
     return samples[np.maximum(np.searchsorted(mesh, time, side="right") - 1, 0)]

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from dfsm.core.types import Array, IntArray
+from dfsm.core.units import agree
 from dfsm.data.derivatives import DerivativeSettings, lead_in
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
@@ -78,6 +79,9 @@ def screened(
     for name in names:
         if not all(name in run for run in kept):
             continue
+        units = [run.channel(name).unit for run in kept]
+        if not all(agree(units[0], unit) for unit in units):
+            continue  # which is said of the runs' units, and needs no guess
         odd = _other_unit([run.window(*window) for run in kept], name)
         if odd is None:
             continue
@@ -100,7 +104,7 @@ def _without_strays(
     first_used = len(run) - len(used)
     for name in names:
         samples = run[name]
-        strays = first_used + _strays(used[name])
+        strays = first_used + stray_rows(used[name])
         if not len(strays):
             continue
         if what == "refuse" or len(strays) > _FEW:
@@ -118,7 +122,7 @@ def _without_strays(
     return run if values is None else replace(run, values=values)
 
 
-def _strays(samples: Array) -> IntArray:
+def stray_rows(samples: Array) -> IntArray:
     """Rows of the samples that are huge, or a few that are far from all others."""
     finite = np.isfinite(samples)
     huge = np.flatnonzero(finite & (np.abs(np.where(finite, samples, 0.0)) > _HUGE))
@@ -129,7 +133,8 @@ def _strays(samples: Array) -> IntArray:
         return huge
     middle = float(np.median(good))
     off = np.where(finite, np.abs(np.where(finite, samples, middle) - middle), 0.0)
-    order = np.argsort(-off, kind="stable")[: _FEW + 1]
+    order = np.argpartition(-off, _FEW)[: _FEW + 1]
+    order = order[np.argsort(-off[order], kind="stable")]
     far = off[order]
     for count in range(1, _FEW + 1):
         if far[count] > 0 and far[count - 1] > _STRAY * far[count]:

@@ -8,13 +8,13 @@ None of this earns a warning of ROSCO.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from dfsm.core.files import existing_file
+from dfsm.controllers.discon import read_discon
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 
@@ -22,8 +22,6 @@ from dfsm.errors import DfsmError
 _DIGITS = 5
 # Values beyond a limit by less than this share of it are rounding.
 _SLACK = 1e-6
-# How a DISCON file ends a value: blanks, an exclamation mark, and the name.
-_LINE = re.compile(r"^\s*([^!]*?)\s*!\s*(\w+)")
 
 CUTS = (
     "ROSCO cuts the pitch to PC_MinPit and PC_MaxPit and its rate to PC_MinRat and PC_MaxRat, lets "
@@ -76,17 +74,12 @@ def read_numbers(path: str | Path) -> dict[str, float]:
     Raises
     ------
     DfsmError
-        The file is missing, or holds no line with a value, an exclamation mark and a name.
+        The file is missing, or is no DISCON file of ROSCO with limits of the pitch.
     """
-    values = {}
-    for line in existing_file(path).read_text("utf-8", errors="replace").splitlines():
-        match = _LINE.match(line)
-        if match is None or not match[1]:
-            continue
-        try:
-            values[match[2]] = float(re.split(r"[\s,]+", match[1])[0].lower().replace("d", "e"))
-        except ValueError:
-            continue
+    discon, values = read_discon(path), dict[str, float]()
+    for key in discon.keys:
+        with suppress(DfsmError, IndexError):  # a name or a file
+            values[key] = discon.number(key)
     if "PC_MaxPit" not in values:
         raise DfsmError(f"{path} has no line of PC_MaxPit, expected a DISCON file of ROSCO")
     return values

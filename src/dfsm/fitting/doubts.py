@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.fitting.delays import late_input, late_note
 from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
@@ -20,10 +20,11 @@ from dfsm.fitting.residuals import Residuals, residuals_of
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.standard_errors import standard_errors
+from dfsm.numerics.time_mesh import std_over
 
 # A coefficient matters where its input makes so much of a row, and is not known where it is less
-# than so many standard errors.
-_MATTERS, _KNOWN = 0.2, 1.0
+# than so many standard errors; its sign is known from so many on.
+_MATTERS, _KNOWN, _SIGN = 0.2, 1.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
         Settings.
     """
     inputs, kinematic = samples.linear_inputs, kinematic_rows(settings.states)
+    even, even_left, runs = _evenly(samples, inputs, left)
     mean = fit.mean_coefficients
     errors = np.full(mean.shape, np.nan)
     notes: list[str] = []
@@ -79,32 +81,53 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
     names, driving = samples.linear_names, len(samples.signals.driving)
     for row in (r for r in range(len(mean)) if r not in kinematic):
         name, target = samples.derivative_names[row][0], samples.derivatives[:, row]
-        errors[row] = standard_errors(inputs, left[:, row], samples.runs)
+        errors[row] = standard_errors(even, even_left[:, row], runs)
         held = {column for r, column in fit.model.known if r == row}
         errors[row, list(held)] = 0.0
         notes += _noise(name, samples, inputs, target, mean[row])
         series = residuals_of(samples.time, samples.runs, inputs, target, left[:, row])
-        note = None if series is None else _feedback(name, samples, series, mean, row, held, laws)
+        note = None
+        if series is not None:
+            note = _feedback(samples, series, mean, row, held, laws, errors[row])
         if note:
             notes.append(note)
             biased.append(name)
             continue
         if not fit.moved:  # for a margin it is no longer the best fit
-            notes += _unknown(name, names, mean[row], errors[row], inputs, target, fit.condition)
+            notes += _unknown(name, names, mean[row], errors[row], samples, target, fit.condition)
         if series is not None and (found := late_input(series, range(driving))):
             notes.append(late_note(name, names[found.column], found, series.unexplained))
             late.append(name)
     return Doubts(tuple(notes), errors, tuple(biased), tuple(late))
 
 
+def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array, IntArray]:
+    """Inputs, what the fit leaves, and the runs, every sample standing for the same time."""
+    if samples.weights is None:
+        return inputs, left, samples.runs
+    table, parts, runs = np.column_stack([inputs, left]), list[Array](), list[IntArray]()
+    numbers = np.unique(samples.runs)
+    whole = [np.ptp(samples.time[samples.runs == k]) for k in numbers]
+    step = sum(whole) / len(table)
+    for k, length in zip(numbers, whole, strict=True):
+        inside = samples.runs == k
+        time = samples.time[inside]
+        even = np.linspace(time[0], time[-1], max(2, round(length / step)))
+        parts.append(np.stack([np.interp(even, time, c) for c in table[inside].T], axis=1))
+        runs.append(np.full(len(even), k))
+    together = np.concatenate(parts)
+    count = inputs.shape[1]
+    return together[:, :count], together[:, count:], np.concatenate(runs)
+
+
 def _feedback(
-    name: str,
     samples: Samples,
     series: Residuals,
     mean: Array,
     row: int,
     held: set[int],
     laws: dict[int, Law],
+    errors: Array,
 ) -> str | None:
     if not much_unexplained(series):
         return None
@@ -117,11 +140,13 @@ def _feedback(
             continue
         if column not in laws:
             laws[column] = follows(series, column, range(states.start, states.stop))
-        if is_feedback(laws[column], A, mean[:, column]):
+        known = abs(mean[row, column]) >= _SIGN * errors[column]
+        if is_feedback(laws[column], A, mean[:, column], known):
             told.append(column)
     if not told:
         return None
     names = [order.names[c] for c in told]
+    name = samples.derivative_names[row][0]
     return feedback_note(
         name, series.unexplained, names, mean[row, told].tolist(), [laws[c] for c in told]
     )
@@ -132,15 +157,16 @@ def _unknown(
     names: Sequence[str],
     row: Array,
     errors: Array,
-    inputs: Array,
+    samples: Samples,
     target: Array,
     condition: float,
 ) -> list[str]:
     """Coefficients that matter and are as large as what is not known of them."""
     if condition > CONDITION_LIMIT:  # told already: they cannot be told apart
         return []
-    size = np.abs(row) * inputs.std(axis=0)
-    matters = (size > _MATTERS * target.std()) & (np.abs(row) < _KNOWN * errors)
+    size = np.abs(row) * std_over(samples.linear_inputs, samples.weights)
+    much = _MATTERS * std_over(target, samples.weights)
+    matters = (size > much) & (np.abs(row) < _KNOWN * errors)
     if not matters.any():
         return []
     if not np.isfinite(errors[matters]).all():

@@ -162,8 +162,7 @@ def _train(
 
 def predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
     """The linear fit of some targets ``(sample, target)``, run by run to bound memory."""
-    parts = [_apply(model, block) for block, _ in samples.blocks(inputs, targets)]
-    return np.concatenate([np.asarray(p) for p in parts])
+    return np.concatenate([predicted(model, b) for b, _ in samples.blocks(inputs, targets)])
 
 
 def predicted(model: LinearModel, inputs: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 
 from dfsm.data.dataset import Dataset
 from dfsm.errors import hushed
-from dfsm.fitting.samples import Samples
+from dfsm.fitting.samples import Samples, known_from
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_path
@@ -25,7 +25,7 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSett
         return samples
     paths = []
     for run in data:
-        inside = np.isin(run.time, run.window(settings.start, settings.stop).time)
+        inside = np.isin(run.time, run.window(known_from(run, settings), settings.stop).time)
         paths.append(latent_path(model, run)[inside])
     at = model.signals.observed_columns.stop
     inputs = np.insert(samples.inputs, [at] * len(model.signals.latents), np.concatenate(paths), 1)
@@ -44,7 +44,8 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
     inputs = samples.inputs.copy()
     names = model.signals.names("states")
     columns = model.signals.state_columns
-    for k, rollout in enumerate(rollouts):
+    for k, (run, rollout) in enumerate(zip(data, rollouts, strict=True)):
         if rollout.status is Status.COMPLETED:
-            inputs[samples.runs == k, columns] = rollout.trajectory.select(names).values
+            inside = rollout.trajectory.window(known_from(run, settings), settings.stop)
+            inputs[samples.runs == k, columns] = inside.select(names).values
     return replace(samples, inputs=inputs)

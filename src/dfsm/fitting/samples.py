@@ -20,7 +20,9 @@ from dfsm.data.derivatives import (
     state_names,
     state_units,
 )
+from dfsm.data.features import unknown_until
 from dfsm.data.info import gap_warning
+from dfsm.data.signs import held_interval
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
 from dfsm.data.suspects import screened
@@ -181,6 +183,7 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     """What a user should know about the data before trusting a fit, one sentence each."""
     doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
     warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
+    warnings += _held_states(data, settings)
     for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
         if values.min() == values.max():
             warnings.append(
@@ -198,6 +201,21 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     return warnings
 
 
+def _held_states(data: Dataset, settings: FitSettings) -> list[str]:
+    """States whose record is slower than its mesh: steps where there is motion."""
+    told = []
+    for name in dict.fromkeys(n for s in settings.states for n in s.channels):
+        for run in data:
+            if interval := held_interval(run.time, run[name]):
+                told.append(
+                    f"{run.where}: '{name}' changes every {interval:g} s only and stays as it was "
+                    "in between, so its derivative is that of steps and its coefficients come out "
+                    f"too small: set data.slower: {{{name}: linear}}, or give that record alone"
+                )
+                break
+    return told
+
+
 def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
     signals = _signals(data, settings)
@@ -211,7 +229,7 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         extracted = differentiate(run, settings.states, settings.derivatives, breaks)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
-        inside = whole.window(settings.start, settings.stop)
+        inside = whole.window(known_from(whole_run, settings), settings.stop)
         rows = np.isin(whole.time, inside.time)
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
@@ -256,6 +274,20 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         weights=weights,
         steps=tuple(steps),
     )
+
+
+def known_from(run: Trajectory, settings: FitSettings) -> float | None:
+    """Where a fit starts: not where a delayed input is still that from before the record."""
+    unknown = unknown_until(settings.features)
+    if not unknown:
+        return settings.start
+    first = float(run.time[0]) + unknown
+    if first >= run.time[-1]:
+        raise DfsmError(
+            f"{run.where} lasts {run.duration:g} s, and a delayed input is not known for the first "
+            f"{unknown:g} s of it: leave the run out, or shorten the delay"
+        )
+    return first if settings.start is None else max(first, settings.start)
 
 
 def _signals(data: Dataset, settings: FitSettings) -> SignalTable:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dfsm.controllers.controller import Controller
 from dfsm.core.units import agree, factor

@@ -1,0 +1,5 @@
+"""``python -m dfsm`` is the command ``dfsm``."""
+
+from dfsm.cli import main
+
+main()
