@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Protocol, runtime_checkable
 
-from dfsm.core.types import Array
-
 
 @runtime_checkable
 class Controller(Protocol):
@@ -23,13 +21,18 @@ class Controller(Protocol):
         Time between two calls in s.
     """
 
-    measurements: tuple[str, ...]
-    measurement_units: tuple[str, ...]
-    commands: tuple[str, ...]
-    command_units: tuple[str, ...]
-    interval: float
+    @property
+    def measurements(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def measurement_units(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def commands(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def command_units(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def interval(self) -> float: ...  # noqa: D102
 
-    def start(self, measurements: Array, commands: Array) -> Any:
+    def start(self, measurements: Any, commands: Any) -> Any:
         """State consistent with running at these values: the first step changes nothing abruptly.
 
         Parameters
@@ -41,7 +44,7 @@ class Controller(Protocol):
         """
         ...
 
-    def step(self, state: Any, measurements: Array, time: Array) -> tuple[Any, Array]:
+    def step(self, state: Any, measurements: Any, time: Any) -> tuple[Any, Any]:
         """Next state, and commands, shape ``(command,)``; pure.
 
         Parameters
