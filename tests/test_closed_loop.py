@@ -102,7 +102,7 @@ def test_a_linear_loop_is_the_matrix_exponential_with_held_commands(model):
     ]
 
 
-def test_on_the_host_and_side_by_side_it_is_the_same(model):
+def test_on_the_host_and_among_others_it_is_the_same(model):
     runs = [run_of(model), run_of(model, TIME[:90], disturbed=1.0, name="short")]
     others = [replace(GAINS, k=k * GAINS.k) for k in (0.5, 1.0, 2.0)]
     many = closed_loops(model, runs, [*others, OnHost(GAINS)], settings=AT_ONCE)

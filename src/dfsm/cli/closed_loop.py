@@ -142,7 +142,7 @@ def _controller(text: str, library: Path | None, interval: float | None) -> Cont
         return BladedLibrary(library, Path(text), interval=interval)
     from dfsm.controllers.rosco import read_rosco
 
-    return read_rosco(text, interval=interval)  # pyright: ignore[reportReturnType]
+    return read_rosco(text, interval=interval)
 
 
 def _own(path: Path, name: str) -> Controller:

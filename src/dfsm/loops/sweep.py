@@ -151,8 +151,7 @@ def sweep(
 ) -> Sweep:
     """Close the loop with every controller over every run.
 
-    Controllers that differ in numbers only, a `ROSCO` with other gains say, go through one
-    compilation, several at once.
+    Controllers that differ in numbers only, a `ROSCO` with other gains say, share one compilation.
 
     Parameters
     ----------

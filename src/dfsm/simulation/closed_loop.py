@@ -27,15 +27,13 @@ from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
-from dfsm.simulation.loop import HostLoop, Path, roll_compiled, roll_many
+from dfsm.simulation.loop import HostLoop, Path, roll_compiled
 from dfsm.simulation.loop_cases import ClosedLoopSettings, LoopCase, padded, prepared_cases
 from dfsm.simulation.simulate import ESCAPE, MUCH_OUTSIDE
 from dfsm.simulation.wires import Wires, connect, not_commanded
 
 # Calls are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 400
-# Controllers that go through one loop side by side.
-_ABREAST = 8
 
 
 class LoopStatus(enum.Enum):
@@ -192,7 +190,7 @@ def closed_loops(
 ) -> list[list[ClosedLoopRun]]:
     """Close the loop with each of several controllers over each of several runs.
 
-    Compiled controllers that differ in numbers only run side by side.
+    Compiled controllers that differ in numbers only share one compilation.
 
     Parameters
     ----------
@@ -218,20 +216,19 @@ def closed_loops(
     intervals = {float(c.interval) for c in controllers}
     cases = {i: prepared_cases(model, runs, i, window, settings) for i in intervals}
     begin = clock.perf_counter()
-    tasks = list[tuple[list[int], int, Callable[[], list[Path]]]]()
-    for members in _alike(controllers):
-        law, wired = [controllers[i] for i in members], wires[members[0]]
-        rolled = _roller(model, wired, law)
-        for run, case in enumerate(cases[float(law[0].interval)]):
-            tasks.append((members, run, partial(rolled, case)))
+    tasks = list[tuple[int, int, Callable[[], Path]]]()
+    for i, controller in enumerate(controllers):
+        rolled = _roller(model, wires[i], controller)
+        for run, case in enumerate(cases[float(controller.interval)]):
+            tasks.append((i, run, partial(rolled, case)))
     results: dict[tuple[int, int], ClosedLoopRun] = {}
-    # XLA keeps a loop on one core; libraries wait in processes of their own.
+    # XLA keeps a loop on one core, and one that holds several controllers side by side costs more
+    # than these in turn; libraries wait in processes of their own.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        rolls = pool.map(lambda task: task[2](), tasks)
-        for (members, run, _), paths in zip(tasks, rolls, strict=True):
-            for i, path in zip(members, paths, strict=True):
-                case = cases[float(controllers[i].interval)][run]
-                results[i, run] = result_of(model, wires[i], controllers[i], case, path)
+        paths = pool.map(lambda task: task[2](), tasks)
+        for (i, run, _), path in zip(tasks, paths, strict=True):
+            case = cases[float(controllers[i].interval)][run]
+            results[i, run] = result_of(model, wires[i], controllers[i], case, path)
     wall = (clock.perf_counter() - begin) / max(1, len(results))
     return [
         [replace(results[i, run], wall_time=wall) for run in range(len(runs))]
@@ -239,30 +236,21 @@ def closed_loops(
     ]
 
 
-def _roller(
-    model: DFSM, wires: Wires, controllers: Sequence[Controller]
-) -> Callable[[LoopCase], list[Path]]:
-    """What closes the loop over one case with controllers that are alike."""
-    if not is_compiled(controllers[0]):
+def _roller(model: DFSM, wires: Wires, controller: Controller) -> Callable[[LoopCase], Path]:
+    """What closes the loop over one case."""
+    if not is_compiled(controller):
         host, low, high = HostLoop(model, wires), *_bounds(model)
 
         def gone(x: Array) -> bool:
             return not bool(((x >= low) & (x <= high)).all())
 
-        def called(case: LoopCase) -> list[Path]:
-            drive = padded(case, len(case.drive.time) + 1)
-            return [host.roll(c, drive, gone) for c in controllers]
+        return lambda case: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
+    # Numbers as arrays: others would be compiled in, and each controller compiled anew.
+    numbers = jax.tree.map(jnp.asarray, controller)
 
-        return called
-
-    def compiled(case: LoopCase) -> list[Path]:
+    def compiled(case: LoopCase) -> Path:
         calls = -(-(len(case.drive.time) + 1) // _PAD) * _PAD
-        drive = padded(case, calls)
-        if len(controllers) == 1:
-            return [roll_compiled(model, wires, controllers[0], drive)]
-        stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *map(_numbers, controllers))
-        paths = jax.tree.map(np.asarray, roll_many(model, wires, stacked, drive))
-        return [jax.tree.map(lambda part, i=i: part[i], paths) for i in range(len(controllers))]
+        return roll_compiled(model, wires, numbers, padded(case, calls))
 
     return compiled
 
@@ -271,29 +259,6 @@ def is_compiled(controller: Any) -> bool:
     """Whether JAX can follow a controller: an equinox module, and what it wraps likewise."""
     inner = getattr(controller, "inner", None)
     return isinstance(controller, eqx.Module) and (inner is None or is_compiled(inner))
-
-
-def _numbers(controller: Any) -> Any:
-    """The controller with all its numbers as arrays."""
-    return jax.tree.map(jnp.asarray, controller)
-
-
-def _alike(controllers: Sequence[Controller]) -> list[list[int]]:
-    """Which controllers go through one loop side by side: compiled, of one structure."""
-    groups: list[list[int]] = []
-    structures: dict[Any, list[int]] = {}
-    for i, controller in enumerate(controllers):
-        if not is_compiled(controller):
-            groups.append([i])
-            continue
-        leaves, structure = jax.tree.flatten(_numbers(controller))
-        key = (structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
-        members = structures.setdefault(key, [])
-        if not members or len(members) == _ABREAST:
-            structures[key] = members = []
-            groups.append(members)
-        members.append(i)
-    return groups
 
 
 # -- judging the outcome ------------------------------------------------------------------------

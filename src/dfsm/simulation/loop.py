@@ -185,13 +185,6 @@ def roll_compiled(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> P
     return roll(model.prepared(), wires, controller, drive)
 
 
-@eqx.filter_jit
-def roll_many(model: DFSM, wires: Wires, controllers: Any, drive: Drive) -> Path:
-    """`roll` with several controllers side by side, whose numbers have a leading axis."""
-    model = model.prepared()
-    return jax.vmap(lambda controller: roll(model, wires, controller, drive))(controllers)
-
-
 # -- on the host --------------------------------------------------------------------------------
 
 
