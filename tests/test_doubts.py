@@ -28,6 +28,7 @@ from dfsm.data.trajectory import Channel
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.feedback import Law, is_feedback
 from dfsm.fitting.fit import fit
+from dfsm.fitting.held_inputs import held_unseen
 from dfsm.fitting.standard_errors import standard_errors
 from dfsm.fitting.verdicts import grade
 from dfsm.models.stability import Growth
@@ -279,3 +280,20 @@ def test_a_state_that_is_held_in_its_file_is_told_and_joined_where_named():
     assert float(model.f.coefficients[0, 0, 1]) > -0.45
     joined = fit([staircase], replace(SETTINGS, slower={"x": "linear"})).model
     assert_allclose(joined.f.coefficients[0, 0], [1, -0.5], rtol=0.05)
+
+
+def test_an_input_that_is_held_and_new_at_every_sample_is_told():
+    u, decay = np.random.default_rng(8).standard_normal(800), np.exp(-0.4)
+    held, lines = np.zeros(800), np.zeros(800)
+    ramp = 1 - (1 - decay) / 0.4
+    for k in range(799):
+        held[k + 1] = decay * held[k] + (1 - decay) * u[k]
+        step = u[k + 1] - u[k]
+        lines[k + 1] = decay * lines[k] + (1 - decay) * u[k] + ramp * step
+    runs = np.zeros(800, dtype=int)
+    assert held_unseen(held[:, None], u[:, None], runs) == [0]
+    assert held_unseen(lines[:, None], u[:, None], runs) == []
+    _, notes = told([run(np.arange(800.0), x=held, u=u)])
+    assert any("set inputs: {u: hold}" in note for note in notes)
+    chosen = fit([run(np.arange(800.0), x=held, u=u)], replace(SETTINGS, inputs="hold")).model
+    assert_allclose(chosen.f.coefficients[0, 0], [0.4, -0.4], rtol=1e-3)

@@ -29,6 +29,7 @@ from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
+from dfsm.fitting.held_inputs import held_note, held_unseen
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.inputs import InputOrder
 from dfsm.models.signals import (
@@ -183,7 +184,7 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     """What a user should know about the data before trusting a fit, one sentence each."""
     doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
     warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
-    warnings += _held_states(data, settings)
+    warnings += _held_states(data, settings) + _held_inputs(data, settings, samples)
     for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
         if values.min() == values.max():
             warnings.append(
@@ -214,6 +215,22 @@ def _held_states(data: Dataset, settings: FitSettings) -> list[str]:
                 )
                 break
     return told
+
+
+def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> list[str]:
+    """Inputs that are taken for lines by nobody's choice, and act as held ones."""
+    chosen = settings.inputs or {}
+    if isinstance(chosen, str) or samples.weights is not None:
+        return []
+    names, states = samples.signals.driving, [s.name for s in settings.states]
+    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
+    found = held_unseen(
+        np.concatenate([run.select(states).values for run in runs]),
+        np.concatenate([run.select(names).values for run in runs]),
+        samples.runs,
+    )
+    kinds = samples.signals.between
+    return [held_note(names[k]) for k in found if kinds[k] == "linear" and names[k] not in chosen]
 
 
 def extract(data: Dataset, settings: FitSettings) -> Samples:
