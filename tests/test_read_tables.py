@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -413,10 +414,11 @@ def test_mat_from_read_fast_binary(tmp_path):
 def test_bad_mat_is_a_sentence(tmp_path):
     path = tmp_path / "a.mat"
     header = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n"
+    told = "is no readable HDF5 file" if find_spec("h5py") else "save with -v7"
     path.write_bytes(header)
-    fails(path, "save with -v7")
+    fails(path, told)
     path.write_bytes(b"\x89HDF\r\n\x1a\n".ljust(600))
-    fails(path, "save with -v7")
+    fails(path, told)
     savemat(path, {"x": np.arange(3)})
     fails(path, "no time column")
     raw = path.read_bytes()

@@ -153,6 +153,8 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = [fill_slower(r, settings.slower) for r in runs]
     window = settings.start, settings.stop
+    for run in runs:
+        run.window(*window)
     runs = screened(list(runs), names, settings.outliers, window, settings.derivatives)
     runs = [with_computed(r, settings.hub_height, settings.features) for r in runs]
     if settings.azimuth is not None:
@@ -161,7 +163,6 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
             require_field(run, settings.azimuth)
     picked = [r.select(names).with_roles(roles) for r in runs]
     for run in picked:
-        run.window(settings.start, settings.stop)
         lead_in(run, settings.start, settings.derivatives).require_finite()
     data = Dataset(picked)
     for name in names:
