@@ -26,7 +26,6 @@ from dfsm.control.names import plant_of
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel
 from dfsm.fitting.corrective import NoCorrection
-from dfsm.fitting.feedback import Law, is_feedback
 from dfsm.fitting.fit import fit
 from dfsm.fitting.held_inputs import held_unseen
 from dfsm.fitting.standard_errors import standard_errors
@@ -234,14 +233,6 @@ def test_stray_samples_and_runs_in_another_unit():
     pulse = np.zeros(100)
     pulse[30] = 1.0
     screened([run(time, x=pulse)], ["x"], "refuse", window, DerivativeSettings())
-
-
-def test_feedback_may_take_an_effect_away_and_turn_its_sign():
-    A_open, b, gain = np.array([[0.0, 1.0], [-0.4, 0.0]]), np.array([0.0, -0.016]), [-0.67, -0.97]
-    law = Law(0.99, np.array(gain))
-    assert is_feedback(law, A_open, b, known=False)
-    assert not is_feedback(law, A_open, b, known=True)  # a state that follows its control
-    assert not is_feedback(Law(0.5, law.gain), A_open, b, known=False)
 
 
 def test_standard_errors_are_those_of_the_time_on_bunched_meshes():

@@ -23,8 +23,8 @@ from dfsm.fitting.standard_errors import standard_errors
 from dfsm.numerics.time_mesh import std_over
 
 # A coefficient matters where its input makes so much of a row, and is not known where it is less
-# than so many standard errors; its sign is known from so many on.
-_MATTERS, _KNOWN, _SIGN = 0.2, 1.0, 2.0
+# than so many standard errors.
+_MATTERS, _KNOWN = 0.2, 1.0
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
         series = residuals_of(samples.time, samples.runs, inputs, target, left[:, row])
         note = None
         if series is not None:
-            note = _feedback(samples, series, mean, row, held, laws, errors[row])
+            note = _feedback(samples, series, mean, row, held, laws)
         if note:
             notes.append(note)
             biased.append(name)
@@ -127,7 +127,6 @@ def _feedback(
     row: int,
     held: set[int],
     laws: dict[int, Law],
-    errors: Array,
 ) -> str | None:
     if not much_unexplained(series):
         return None
@@ -140,8 +139,7 @@ def _feedback(
             continue
         if column not in laws:
             laws[column] = follows(series, column, range(states.start, states.stop))
-        known = abs(mean[row, column]) >= _SIGN * errors[column]
-        if is_feedback(laws[column], A, mean[:, column], known):
+        if is_feedback(laws[column], A, mean[:, column]):
             told.append(column)
     if not told:
         return None

@@ -13,8 +13,7 @@ with lags τ_k from the control's own correlation time on. What is that slow sta
 integrals and filters of a controller and cannot differentiate: a state's derivative holds the
 control that moves it in open loop, too. There is one more way in which a state tells its control
 in open loop, a state that follows at once: then the law K moves the fit's eigenvalues right,
-where a controller moves them left, and the control's effect is known well. Feedback may take
-the effect away altogether; then its sign tells nothing.
+where a controller moves them left.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ def _lagged(x: Array, lag: float) -> Array:
     return lfilter([1 - decay], [1.0, -decay], x, axis=0, zi=decay * x[:1])[0]
 
 
-def is_feedback(law: Law, A: Array, b: Array, known: bool) -> bool:
+def is_feedback(law: Law, A: Array, b: Array) -> bool:
     """Whether a law is a controller's, and not the answer of a state that follows its control.
 
     Parameters
@@ -113,13 +112,9 @@ def is_feedback(law: Law, A: Array, b: Array, known: bool) -> bool:
         Of one control.
     A, b
         Of the fit, ``(state, state)`` and ``(state,)``.
-    known
-        Whether the control's effect is more than chance.
     """
     if law.explained < _FOLLOWS:
         return False
-    if not known:
-        return True
     closed = A + np.outer(b, law.gain)
     return bool(b @ law.gain < 0 or _growth(closed) < _growth(A))
 
