@@ -169,7 +169,7 @@ def test_every_limit_of_a_deck_that_the_file_breaks_is_named(solution, result, t
     shown = dfsm("export-rosco", result, "-o", tmp_path / "ol.dat", "--discon", narrow)
     assert "PC_MinPit is 0.5: the file goes to" in shown.out
     narrow.write_text("nothing of ROSCO\n", "ascii")
-    with pytest.raises(DfsmError, match="expected ROSCO's DISCON.IN"):
+    with pytest.raises(DfsmError, match=r"expected ROSCO's DISCON\.IN"):
         write_rosco(solution, tmp_path / "ol.dat", discon=narrow)
 
 
