@@ -1,7 +1,7 @@
 """Run the measurements and print one JSON object.
 
-python -m benchmarks [derivatives] [accuracy] [speed] [parameters] [scaling] [rollouts] [unseen]
-    [limits] [matched] [control] [codesign] [peer] [fuzz] [kill]
+python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
+    [unseen] [limits] [matched] [control] [codesign] [peer] [fuzz] [kill]
 
 Without names all but `peer`, which makes an environment of its own and installs jax-sysid there,
 and `fuzz` and `kill`, which damage inputs and end commands for hours (``fuzz --inputs 20000``).
@@ -22,6 +22,7 @@ from benchmarks import (
     codesign,
     control,
     derivatives,
+    field,
     fuzz,
     kill,
     limits,
@@ -37,6 +38,7 @@ from dfsm.core.files import json_value
 
 PARTS: dict[str, Callable[..., object]] = {
     "derivatives": derivatives.run,
+    "field": field.run,
     "accuracy": accuracy.run,
     "speed": speed.run,
     "parameters": parameters.run,

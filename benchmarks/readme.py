@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import control_tables, fit_tables, turbine_tables, unseen
+from benchmarks import control_tables, field, fit_tables, turbine_tables, unseen
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = ("method.md", "optimal-control.md", "floating-turbine.md")
+PAGES = ("method.md", "optimal-control.md", "floating-turbine.md", "what-a-fit-says.md")
 FILES = (ROOT / "README.md", *(DOCS / name for name in PAGES))
 
 TABLES = {
@@ -80,6 +80,8 @@ def main() -> None:
     ):
         if part in figures:
             tables |= {name: table(figures[part]) for name, table in group.items()}
+    if "field" in figures:
+        tables["records"] = field.field_table(figures["field"])
     if "peer" in figures:
         tables["peer"] = turbine_tables.rollouts_table(figures["peer"])
     if "control" in figures:
