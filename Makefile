@@ -14,7 +14,7 @@ demo: $(VENV)/.installed
 
 # Everything but the studies. XLA's own loops are compiled in half the time without its fusion
 # emitters and take up to 1.7 times as long: tests compile more than they compute.
-test: export XLA_FLAGS += --xla_cpu_use_fusion_emitters=false
+test: export XLA_FLAGS += --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 test: $(VENV)/.installed-dev
 	$(PYTEST) -m "not slow"
 

@@ -9,7 +9,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.numerics.filters import low_pass
 from dfsm.numerics.spectra import spectrum
-from dfsm.numerics.time_mesh import time_step
+from dfsm.numerics.time_mesh import time_step, without_rounding
 
 STEP = 0.00625
 EXACT = STEP * np.arange(96001)
@@ -73,3 +73,9 @@ def test_gaps_and_drifts_are_not_equidistant_anywhere(time):
         spectrum(time, np.sin(time))
     with pytest.raises(DfsmError, match="needs an equidistant mesh"):
         low_pass(time, np.sin(time), 0.2)
+
+
+def test_times_beyond_single_precision_are_times():
+    time = 1e300 * np.arange(5)
+    assert time_step(time) == pytest.approx(1e300)
+    assert np.array_equal(without_rounding(time), time)

@@ -103,10 +103,17 @@ def own_interval(time: Series, present: NDArray[np.bool_]) -> float | None:
     return time_step(time[rows])
 
 
+def _single_spacing(largest: float) -> float:
+    """Distance of numbers of single precision there; infinite beyond their range."""
+    if largest > np.finfo(np.float32).max:
+        return np.inf
+    return float(np.spacing(np.float32(largest)))
+
+
 def _rounding(time: Series, step: float) -> float:
     """Unit in s to which the times of an equidistant mesh seem to be rounded; 0 for none."""
     largest, most = np.abs(time).max(), _COARSE * step
-    single = float(np.spacing(np.float32(largest)))
+    single = _single_spacing(largest)
     if single <= most and np.array_equal(time.astype(np.float32), time):
         return single
     slack = 4 * np.spacing(largest)
@@ -192,7 +199,7 @@ def same_instant(time: Series) -> np.ndarray:
     # The mean: where every sample is written twice, the median is of the wrong kind.
     usual, largest = (time[-1] - time[0]) / len(steps), np.abs(time).max()
     limit = max(_INSTANT * usual, 4 * float(np.spacing(largest)))
-    single = 1.5 * float(np.spacing(np.float32(largest)))
+    single = 1.5 * _single_spacing(largest)
     if single < _SHARE * usual and np.array_equal(time.astype(np.float32), time):
         limit = max(limit, single)
     return steps <= limit
