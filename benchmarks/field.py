@@ -49,7 +49,7 @@ class System:
 
 
 def _record(time: Array, **channels: Array) -> dfsm.Trajectory:
-    named = [dfsm.Channel(name, "m" if name == "x" else "N") for name in channels]
+    named = tuple(dfsm.Channel(name, "m" if name == "x" else "N") for name in channels)
     return dfsm.Trajectory(time, np.stack(list(channels.values()), axis=1), named)
 
 
