@@ -41,6 +41,8 @@ def same(values, expected: np.ndarray) -> None:
 # -- the model ----------------------------------------------------------------------------------
 
 
+# The last bits are those of code as users compile it, which `make test` does not.
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_it_predicts_what_it_did(models, predictions, name):
     at = models[name].split(predictions[f"{name}/inputs"])
