@@ -11,6 +11,7 @@ import numpy as np
 
 from dfsm.controllers.rosco_blocks import within
 from dfsm.controllers.traced import traced
+from dfsm.controllers.wrapper import Wrapper
 from dfsm.core.settings import require
 from dfsm.errors import DfsmError, missing
 
@@ -24,7 +25,7 @@ class ActuatorState(NamedTuple):
     moves: jax.Array
 
 
-class Actuator(eqx.Module):
+class Actuator(Wrapper):
     """A `Controller` whose commands reach the plant through an actuator.
 
         p̈ = ω² (u - p) - 2 ζ ω ṗ,      |ṗ| and p within their limits
@@ -51,7 +52,6 @@ class Actuator(eqx.Module):
         A command that the controller does not set, or limits the wrong way round.
     """
 
-    inner: Any
     corner: jax.Array | None = None
     damping: jax.Array = eqx.field(converter=jnp.asarray, default=0.7)  # pyright: ignore[reportAssignmentType]
     rate: jax.Array = eqx.field(converter=jnp.asarray, default=np.inf)  # pyright: ignore[reportAssignmentType]
@@ -66,31 +66,6 @@ class Actuator(eqx.Module):
         require(bool(np.all(np.asarray(self.rate) > 0)), "rate", self.rate, "more than 0")
         low, high = (np.asarray(limit) for limit in self.limits)
         require(bool((low < high).all()), "limits", self.limits, "the lower one first")
-
-    @property
-    def measurements(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.measurements
-
-    @property
-    def measurement_units(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.measurement_units
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.commands
-
-    @property
-    def command_units(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.command_units
-
-    @property
-    def interval(self) -> float:
-        """That of the controller."""
-        return self.inner.interval
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> ActuatorState:
         """At rest where the plant's controls are; see `Controller.start`."""

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.controllers.wrapper import Wrapper
 from dfsm.core.settings import require
 from dfsm.errors import DfsmError, missing
 
@@ -21,7 +22,7 @@ class SensorState(NamedTuple):
     calls: jax.Array
 
 
-class Sensor(eqx.Module):
+class Sensor(Wrapper):
     """A `Controller` that sees its measurements through a sensor.
 
     First a low-pass ω / (s + ω), exact for a measurement that is held over the interval; then the
@@ -48,7 +49,6 @@ class Sensor(eqx.Module):
         A measurement that the controller does not read, or a negative delay.
     """
 
-    inner: Any
     corner: jax.Array | None = None
     noise: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
     delay: float = eqx.field(static=True, default=0.0)
@@ -59,31 +59,6 @@ class Sensor(eqx.Module):
         require(self.delay >= 0, "delay", self.delay, "seconds, at least 0")
         if lost := [n for n in self.acts_on or () if n not in self.inner.measurements]:
             raise DfsmError(f"acts_on: the controller has {missing(lost, self.inner.measurements)}")
-
-    @property
-    def measurements(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.measurements
-
-    @property
-    def measurement_units(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.measurement_units
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.commands
-
-    @property
-    def command_units(self) -> tuple[str, ...]:
-        """Those of the controller."""
-        return self.inner.command_units
-
-    @property
-    def interval(self) -> float:
-        """That of the controller."""
-        return self.inner.interval
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> SensorState:
         """The sensor has seen these for long; see `Controller.start`."""
