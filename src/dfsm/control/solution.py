@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from dfsm.control.mesh.grid import Grid
+from dfsm.core.drawing import Drawn, Engine, draw
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import printable
@@ -129,7 +130,7 @@ class Replay:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Drawn):
     """Optimal trajectories, or the best that a solve came to.
 
     Attributes
@@ -259,6 +260,36 @@ class Solution:
             for role in ("state", "control")
         )
         return self.grid.states(X, tau), self.grid.controls(U, tau)
+
+    def plot(
+        self,
+        channels: Sequence[str] | None = None,
+        *,
+        scenario: int = 0,
+        engine: Engine = "plotly",
+    ) -> Any:
+        """Draw one scenario: disturbances, controls, states, outputs and their bounds.
+
+        Parameters
+        ----------
+        channels
+            Names to draw, in this order; None takes all but the parameters.
+        scenario
+            Which one.
+        engine
+            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
+
+        Returns
+        -------
+        plotly.graph_objects.Figure or matplotlib.figure.Figure
+            To show, change or save.
+
+        Raises
+        ------
+        DfsmError
+            There is no such channel, scenario or engine, or Matplotlib is not installed.
+        """
+        return draw(self, channels, engine, scenario=scenario)
 
     def summary(self) -> str:
         """Describe the outcome in a few lines."""

@@ -12,60 +12,24 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dfsm.core.drawing import Drawn
 from dfsm.core.types import Array
+from dfsm.data.channel import Channel, Role, labels
 from dfsm.errors import DfsmError, missing, printable
 from dfsm.numerics.time_mesh import instants_apart, own_interval, time_step
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Role = Literal["state", "control", "disturbance", "output", "parameter"]
-
-
-@dataclass(frozen=True)
-class Channel:
-    """What is known about one signal.
-
-    Attributes
-    ----------
-    name
-        Name as in the file.
-    unit
-        Unit as in the file, without brackets; never guessed.
-    step
-        Quantisation step in `unit`, where the file states it (16-bit `.outb`), else None. A
-        rounding error is uniform over one step, so its variance is ``step**2 / 12``.
-    role
-        What the signal is to a model, once that has been chosen.
-    computed
-        Whether it follows from other channels of the run, up to a processor's rounding.
-    """
-
-    name: str
-    unit: str = ""
-    step: float | None = None
-    role: Role | None = None
-    computed: bool = False
-
-    @property
-    def label(self) -> str:
-        """Name and unit as an axis label shows them."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
-
-
-def labels(channels: Sequence[Channel], most: int = 8) -> str:
-    """Names and units of the first channels, for one line of text."""
-    shown = ", ".join(printable(c.label) for c in channels[:most])
-    return f"{shown}, …" if len(channels) > most else shown or "none"
+    import xarray as xr
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Drawn):
     """One simulation: channels sampled on one strictly increasing time mesh.
 
     Attributes
@@ -346,7 +310,7 @@ class Trajectory:
         values = np.stack([np.interp(time, self.time, v) for v in self.values.T], axis=1)
         return replace(self, time=time, values=values)
 
-    # -- pandas ---------------------------------------------------------------------------------
+    # -- pandas and xarray ----------------------------------------------------------------------
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a table indexed by time; units are in ``frame.attrs['units']``."""
@@ -383,25 +347,52 @@ class Trajectory:
         DfsmError
             There is no column, or a column or the index is not numeric.
         """
-        known: Mapping[str, str] = frame.attrs.get("units", {}) if units is None else units
-        where = source or name
-        columns = []
-        if not len(frame.columns):
-            raise DfsmError(
-                f"{where}: the table has no column besides its index, expected channels"
-            )
-        # By position: a name that stands twice is told by the constructor below.
-        for i, column in enumerate(frame.columns):
-            try:
-                columns.append(frame.iloc[:, i].to_numpy(dtype=np.float64))
-            except (TypeError, ValueError) as error:
-                raise DfsmError(f"{where}: column '{column}' is not numeric ({error})") from None
-        try:
-            time = frame.index.to_numpy(dtype=np.float64)
-        except (TypeError, ValueError):
-            raise DfsmError(f"{where}: the index is not time in s; set it to the time") from None
-        channels = tuple(Channel(str(c), known.get(str(c), "")) for c in frame.columns)
-        return cls(time, np.stack(columns, axis=1), channels, name=name, source=source)
+        from dfsm.data.frames import from_pandas
+
+        return from_pandas(frame, units, name, source)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a dataset of one variable per channel over ``time``, with units and roles.
+
+        Raises
+        ------
+        DfsmError
+            xarray is not installed, or a channel is called "time".
+        """
+        from dfsm.data.frames import to_xarray
+
+        return to_xarray(self)
+
+    @classmethod
+    def from_xarray(
+        cls,
+        data: xr.Dataset | xr.DataArray,
+        *,
+        time: str | None = None,
+        name: str | None = None,
+        source: str | None = None,
+    ) -> Trajectory:
+        """Build a trajectory from variables over time, or an array over time and channels.
+
+        Parameters
+        ----------
+        data
+            Attribute ``units`` gives the unit of each variable; a variable without dimension is
+            constant. The time is in s, or of dates, which count from the first.
+        time
+            Dimension that is the time; None takes the only one, or "time" where there are more.
+        name, source
+            See `Trajectory`; None takes those of the dataset's attributes.
+
+        Raises
+        ------
+        DfsmError
+            xarray is not installed, a variable has other dimensions or is not numeric, or the
+            times are not known.
+        """
+        from dfsm.data.frames import from_xarray
+
+        return from_xarray(data, time, name, source)
 
 
 def _described(run: Trajectory, channels: Sequence[Channel | str] | Channel | str) -> list[Channel]:

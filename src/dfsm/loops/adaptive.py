@@ -21,6 +21,7 @@ from dfsm.control.nlp.shot import Method
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Ending, Solution
 from dfsm.control.solve import solve
+from dfsm.core.drawing import Engine, Shown, draw
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import require, settings_class
@@ -120,7 +121,7 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
-class AdaptiveResult:
+class AdaptiveResult(Shown):
     """Where `optimize_adaptively` ended, and all rounds on the way.
 
     Attributes
@@ -151,6 +152,21 @@ class AdaptiveResult:
     def message(self) -> str:
         """One sentence on the outcome."""
         return self.status.value
+
+    def plot(self, *, engine: Engine = "plotly") -> Any:
+        """Draw the objective of every round, predicted and realised.
+
+        Parameters
+        ----------
+        engine
+            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
+
+        Returns
+        -------
+        plotly.graph_objects.Figure or matplotlib.figure.Figure
+            To show, change or save.
+        """
+        return draw(self, None, engine)
 
     def summary(self) -> str:
         """Describe the rounds in a line each."""

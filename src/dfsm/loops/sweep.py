@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from dfsm.controllers.controller import Controller
+from dfsm.core.drawing import Drawn
 from dfsm.core.files import json_value
 from dfsm.core.settings import require, settings_class
 from dfsm.core.units import factor
@@ -83,7 +84,7 @@ class Swept:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class Sweep(Drawn):
     """Result of `sweep`.
 
     Attributes

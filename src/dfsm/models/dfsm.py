@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.drawing import Shown
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import labels
 from dfsm.errors import DfsmError, printable
@@ -83,6 +84,14 @@ class DFSM(eqx.Module):
         if outputs := len(self.signals.outputs):
             rows += f" and {len(self.corrected_outputs)} of {outputs} outputs"
         return f"<DFSM: {kind}, {rows} corrected; {'; '.join(told)}>"
+
+    def __str__(self) -> str:
+        from dfsm.models.summary import wrapped
+
+        return wrapped(self)
+
+    def _repr_html_(self) -> str:
+        return Shown._repr_html_(self)  # pyright: ignore[reportArgumentType]
 
     # -- evaluation -----------------------------------------------------------------------------
 

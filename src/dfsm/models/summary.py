@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import numpy as np
 
+from dfsm.errors import printable
 from dfsm.models.dfsm import DFSM
 from dfsm.models.stability import told_growths
+
+# Columns of the narrowest terminal in use.
+_COLUMNS = 80
 
 
 def lines_of(model: DFSM, warnings: bool = True) -> list[str]:
@@ -43,6 +49,24 @@ def lines_of(model: DFSM, warnings: bool = True) -> list[str]:
     if warnings:
         lines += [f"warning: {text}" for text in record.get("warnings", [])]
     return lines
+
+
+def wrapped(model: DFSM, columns: int = _COLUMNS) -> str:
+    """Describe a model in lines that fit a terminal, what goes on indented further.
+
+    Parameters
+    ----------
+    model
+        Any.
+    columns
+        Of the terminal.
+    """
+    told = []
+    for line in map(printable, lines_of(model)):
+        margin = " " * (len(line) - len(line.lstrip()))
+        told += textwrap.wrap(line, columns, initial_indent="", subsequent_indent=margin + "    ",
+                              break_on_hyphens=False) or [""]  # fmt: skip
+    return "\n".join(told)
 
 
 def _stability(model: DFSM) -> list[str]:

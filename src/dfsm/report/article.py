@@ -16,7 +16,7 @@ from dfsm.core.types import Array
 MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-Style = Literal["line", "dashed", "points", "steps"]
+Style = Literal["line", "dashed", "points", "steps", "band"]
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,8 @@ class Curve:
         Curves of one name share one entry of the legend.
     x, y
         Shape ``(point,)``; "steps" draws a histogram, x being the middles of its bins.
+    upper
+        Upper end of a "band", whose lower end is `y`.
     colour
         0 for the truth, 1, 2, … for what is compared with it.
     style
@@ -82,6 +84,7 @@ class Curve:
     y: Array
     colour: int = 1
     style: Style = "line"
+    upper: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def closed_loop_article(validation: ClosedLoopValidation, model: str, controller
             "figures",
             "Closed loop against the record",
             (done, *validation.endings()),
-            (_over_runs(validation),),
+            (over_runs(validation),),
         ),
         Section("runs", "Each run", tables=(_by_run(validation),)),
     ]
@@ -48,7 +48,8 @@ def closed_loop_article(validation: ClosedLoopValidation, model: str, controller
     return Article("closed_loop", "Closed loop", lede, tuple(sections))
 
 
-def _over_runs(validation: ClosedLoopValidation) -> Table:
+def over_runs(validation: ClosedLoopValidation) -> Table:
+    """Figures of every channel over all runs, simulated over recorded."""
     rows = []
     for channel in validation.channels:
         row = validation.row(channel.name)

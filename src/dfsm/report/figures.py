@@ -184,18 +184,28 @@ def _ending(simulation: Simulation, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _range(name: str, run: RunComparison, drawn: Sequence[Trajectory]) -> list[float]:
-    """Y-range of a panel: the recorded signal and what is drawn beside it, within reason."""
-    recorded = run.recorded[name]
+    return list(within_reason(run.recorded[name], [trajectory[name] for trajectory in drawn]))
+
+
+def within_reason(recorded: Array, drawn: Sequence[Array]) -> tuple[float, float]:
+    """Y-range of a panel: the recorded signal and what is drawn beside it, within reason.
+
+    Parameters
+    ----------
+    recorded
+        Shape ``(time,)``, finite.
+    drawn
+        Of other signals; one that is not finite has no say.
+    """
     low, high = float(recorded.min()), float(recorded.max())
     span = (high - low) or max(abs(high), 1.0)
     reach = 0.6 * span
     least, most = low, high
-    for trajectory in drawn:
-        values = trajectory[name]
+    for values in drawn:
         if np.isfinite(values).all():
             least = min(least, max(float(values.min()), low - reach))
             most = max(most, min(float(values.max()), high + reach))
-    return [least - 0.12 * span, most + 0.12 * span]
+    return least - 0.12 * span, most + 0.12 * span
 
 
 def _histogram(validation: Validation, name: str, blobs: Blobs) -> dict[str, Any] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from dfsm.report.article import Article, Curve, Figure, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Sheet
 
 # Colours that colour-blind readers can tell apart (Okabe and Ito), darkened for white paper.
 _COLOURS = ("#8c959d", "#0072b2", "#d55e00", "#00916a", "#a64d8c", "#8a6d00")
@@ -67,22 +69,12 @@ def write_figures(article: Article, folder: str | Path) -> list[Path]:
     DfsmError
         Matplotlib is not installed, or a file cannot be written.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as Sheet
-    except ImportError:
-        raise DfsmError(
-            "figures for print need matplotlib: pip install 'dfsm[figures]', or do without"
-        ) from None
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     written = []
-    with mpl.rc_context(_STYLE):
+    with _styled():
+        folder.mkdir(parents=True, exist_ok=True)
         for figure in article.figures():
-            sheet = Sheet(layout="constrained")
-            FigureCanvasAgg(sheet)
-            _draw(sheet, figure)
+            sheet = sheet_of(figure)
             for suffix in (".pdf", ".png"):
                 path = folder / (figure.key + suffix)
                 with write_file(path) as temporary:
@@ -91,6 +83,34 @@ def write_figures(article: Article, folder: str | Path) -> list[Path]:
                     sheet.savefig(temporary, format=suffix[1:], metadata=stamp)
                 written.append(path)
     return written
+
+
+def sheet_of(figure: Figure) -> Sheet:
+    """Return a Matplotlib figure.
+
+    Raises
+    ------
+    DfsmError
+        Matplotlib is not installed.
+    """
+    with _styled():
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure as Sheet
+
+        sheet = Sheet(layout="constrained")
+        FigureCanvasAgg(sheet)
+        _draw(sheet, figure)
+    return sheet
+
+
+def _styled() -> AbstractContextManager[None]:
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        raise DfsmError(
+            "figures for print need matplotlib: pip install 'dfsm[figures]', or do without"
+        ) from None
+    return mpl.rc_context(_STYLE)
 
 
 def _draw(sheet: Any, figure: Figure) -> None:
@@ -116,6 +136,8 @@ def _draw(sheet: Any, figure: Figure) -> None:
     for place in axes[:count]:
         for line, name in zip(*place.get_legend_handles_labels(), strict=True):
             handles.setdefault(name, line)
+    if len(handles) < 2 and figure.stacked:
+        return
     sheet.legend(
         handles.values(),
         handles.keys(),
@@ -135,9 +157,9 @@ def _columns(count: int) -> int:
 def _panel(place: Axes, panel: Panel) -> None:
     for curve in panel.curves:
         _curve(place, curve)
-    place.set_title(panel.title, loc="left")
-    place.set_xlabel(panel.x)
-    place.set_ylabel(panel.y)
+    place.set_title(_plain(panel.title), loc="left")
+    place.set_xlabel(_plain(panel.x))
+    place.set_ylabel(_plain(panel.y))
     if "x" in panel.log:
         place.set_xscale("log")
     if "y" in panel.log:
@@ -145,24 +167,43 @@ def _panel(place: Axes, panel: Panel) -> None:
     if panel.y_range:
         place.set_ylim(*panel.y_range)
     if panel.x_ticks:
-        place.set_xticks([value for value, _ in panel.x_ticks], [t for _, t in panel.x_ticks])
+        values, texts = zip(*panel.x_ticks, strict=True)
+        place.set_xticks(values, [_plain(t) for t in texts])
         place.minorticks_off()
     if panel.ticks:
-        place.set_yticks([value for value, _ in panel.ticks], [text for _, text in panel.ticks])
+        values, texts = zip(*panel.ticks, strict=True)
+        place.set_yticks(values, [_plain(t) for t in texts])
         place.grid(axis="y", linewidth=0.3, color="#d9dee3")
+
+
+def _plain(text: str) -> str:
+    """Names are data: no part of one is read as a formula."""
+    return text.replace("$", r"\$")
 
 
 def _curve(place: Axes, curve: Curve) -> None:
     colour = _COLOURS[0] if curve.colour == 0 else _COLOURS[1 + (curve.colour - 1) % 5]
+    name = _plain(curve.name)
     if curve.style == "points":
-        place.plot(curve.x, curve.y, "o", label=curve.name, mfc="none", mec=colour, ms=4, mew=1.0)
+        place.plot(curve.x, curve.y, "o", label=name, mfc="none", mec=colour, ms=4, mew=1.0)
         return
     if curve.style == "steps":
-        place.step(curve.x, curve.y, where="mid", label=curve.name, color=colour)
+        place.step(curve.x, curve.y, where="mid", label=name, color=colour)
+        return
+    if curve.style == "band":
+        place.fill_between(
+            curve.x,
+            curve.y,
+            curve.upper,
+            label=name,
+            color=colour,
+            alpha=0.2,
+            linewidth=0,
+        )
         return
     dashed = curve.style == "dashed"
     # The truth stays visible under what agrees with it.
     width = 2.0 if curve.colour == 0 and not dashed else 0.9
     dash = (0, (4, 2.5)) if dashed else "-"
     values = np.asarray(curve.y)
-    place.plot(curve.x, values, label=curve.name, color=colour, linewidth=width, linestyle=dash)
+    place.plot(curve.x, values, label=name, color=colour, linewidth=width, linestyle=dash)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from dfsm.control.solution import Solution
-from dfsm.data.trajectory import Role
-from dfsm.report.article import Article, Section, Table
+from dfsm.data.trajectory import Role, Trajectory
+from dfsm.report.article import Article, Figure, Section, Table
 from dfsm.report.article_page import write_article
 from dfsm.report.control_figures import stacked_figure
 
@@ -46,13 +47,14 @@ def solution_article(solution: Solution) -> Article:
         title=solution.name,
         lede=solution.message[:1].upper() + solution.message[1:] + ".",
         sections=(
-            Section("outcome", "Outcome", tables=(_outcome(solution),)),
+            Section("outcome", "Outcome", tables=(outcome(solution),)),
             *[_scenario(solution, k, count) for k in range(count)],
         ),
     )
 
 
-def _outcome(s: Solution) -> Table:
+def outcome(s: Solution) -> Table:
+    """How a solve ended, and what it came to."""
     time = s.trajectory.time
     rows: list[tuple[str, str | float | None]] = [
         ("ended", s.ending.name.lower().replace("_", " ")),
@@ -87,7 +89,7 @@ def _optimality(s: Solution) -> list[tuple[str, str | float | None]]:
 
 def _scenario(s: Solution, k: int, count: int) -> Section:
     run = s.trajectories[k]
-    names = [c.name for role in _ROLES for c in run.channels if c.role == role]
+    names = _names(run)
     rows = tuple(
         (
             f"{name} ({run.channel(name).unit})" if run.channel(name).unit else name,
@@ -108,13 +110,31 @@ def _scenario(s: Solution, k: int, count: int) -> Section:
         ),
         digits=5,
     )
-    label = f"scenario {k + 1}" if count > 1 else "optimum"
-    figure = stacked_figure(
-        f"course_{k + 1}",
-        "Disturbances, controls, states and outputs. Dashed: bounds near enough to be shown.",
-        {label: s},
-        names,
-        scenario=k,
-    )
     heading = f"Scenario {k + 1}: {run.name}" if count > 1 else "Signals"
-    return Section(f"scenario-{k + 1}", heading, tables=(table,), figures=(figure,))
+    return Section(f"scenario-{k + 1}", heading, tables=(table,), figures=(course(s, k),))
+
+
+def course(solution: Solution, scenario: int = 0, names: Sequence[str] | None = None) -> Figure:
+    """Signals of one scenario above each other, with their bounds.
+
+    Parameters
+    ----------
+    solution
+        From `solve`.
+    scenario
+        Which one.
+    names
+        Of the signals; None takes all but the parameters.
+    """
+    label = f"scenario {scenario + 1}" if len(solution.trajectories) > 1 else "optimum"
+    return stacked_figure(
+        f"course_{scenario + 1}",
+        "Disturbances, controls, states and outputs. Dashed: bounds near enough to be shown.",
+        {label: solution},
+        _names(solution.trajectories[scenario]) if names is None else names,
+        scenario=scenario,
+    )
+
+
+def _names(run: Trajectory) -> list[str]:
+    return [c.name for role in _ROLES for c in run.channels if c.role == role]

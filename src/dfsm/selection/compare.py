@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from dfsm.core.bundle import MANIFEST, is_as_written, signed
+from dfsm.core.drawing import Drawn
 from dfsm.core.exchange import recover
 from dfsm.core.fallback import write_or_keep
 from dfsm.core.files import check_file, json_value, write_json
@@ -84,7 +85,7 @@ class RankedCandidate:
 
 
 @dataclass(frozen=True)
-class Ranking:
+class Ranking(Drawn):
     """Candidates, best first: completed ones by score, then by the number of rollouts lost.
 
     Attributes

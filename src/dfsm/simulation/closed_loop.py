@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
+from dfsm.core.drawing import DrawnRun
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
@@ -48,7 +49,7 @@ class LoopStatus(enum.Enum):
 
 
 @dataclass(frozen=True)
-class ClosedLoopRun:
+class ClosedLoopRun(DrawnRun):
     """A closed loop along one run.
 
     Attributes

@@ -15,6 +15,7 @@ from typing import Literal, get_args, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dfsm.core.drawing import DrawnRun
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
@@ -109,7 +110,7 @@ class Status(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Simulation:
+class Simulation(DrawnRun):
     """A rollout.
 
     Attributes

@@ -8,12 +8,13 @@ phase, so errors at equal times stand beside them, not in their place.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dfsm.controllers.controller import Controller
+from dfsm.core.drawing import Drawn, Engine, draw
 from dfsm.core.files import json_value
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import hushed
@@ -25,6 +26,9 @@ from dfsm.simulation.loop_cases import ClosedLoopSettings
 from dfsm.simulation.simulate import Simulation, Status, simulate
 from dfsm.validation.results import ChannelError, ChannelStatistics
 from dfsm.validation.validate import all_statistics, frequency_bands, recorded_channels
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Wöhler exponent of the one damage-equivalent load in tables.
 SHOWN_EXPONENT = "4"
@@ -88,7 +92,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class ClosedLoopValidation:
+class ClosedLoopValidation(Drawn):
     """Closed loops against records.
 
     Attributes
@@ -145,6 +149,44 @@ class ClosedLoopValidation:
             nrmse=float(np.mean([r.loop_errors[channel].nrmse for r in runs])),
             replay_nrmse=_mean(errors),
         )
+
+    def plot(
+        self,
+        channels: Sequence[str] | None = None,
+        *,
+        run: int | str = 0,
+        engine: Engine = "plotly",
+    ) -> Any:
+        """Draw one run: the record, the closed loop and the open-loop replay.
+
+        Parameters
+        ----------
+        channels
+            Names to draw, in this order; None takes all in their order.
+        run
+            Which run, by its index or name.
+        engine
+            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
+
+        Returns
+        -------
+        plotly.graph_objects.Figure or matplotlib.figure.Figure
+            To show, change or save.
+
+        Raises
+        ------
+        DfsmError
+            There is no such channel, run or engine, or Matplotlib is not installed.
+        """
+        return draw(self, channels, engine, run=run)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table of one line per channel: means and ratios over the runs, as `row`."""
+        import pandas as pd
+
+        rows = {c.name: row for c in self.channels if (row := self.row(c.name)) is not None}
+        lines = {name: asdict(row) for name, row in rows.items()}
+        return pd.DataFrame.from_dict(lines, orient="index")
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values: all figures, without time series and spectra; None where not finite."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dfsm.core.drawing import Drawn, Engine, draw
 from dfsm.core.files import json_value
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import Channel, Trajectory
@@ -17,6 +18,9 @@ from dfsm.numerics.spectra import Spectrum
 from dfsm.numerics.time_mesh import mean_over, std_over
 from dfsm.simulation.simulate import MUCH_OUTSIDE, Simulation, Status
 from dfsm.validation.intervals import Intervals
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Share of its training spread below which a signal is at rest: errors have no scale there.
 _STILL = 0.01
@@ -161,7 +165,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class Validation:
+class Validation(Drawn):
     """Everything that a report shows.
 
     Attributes
@@ -281,6 +285,56 @@ class Validation:
             return None
         return float(np.mean(known)) / self.wall_time(model)
 
+    def plot(
+        self,
+        channels: Sequence[str] | None = None,
+        *,
+        run: int | str = 0,
+        engine: Engine = "plotly",
+    ) -> Any:
+        """Draw one run: the record beside what every model made of it.
+
+        Parameters
+        ----------
+        channels
+            Names to draw, in this order; None takes measured states and outputs.
+        run
+            Which run, by its index or name.
+        engine
+            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
+
+        Returns
+        -------
+        plotly.graph_objects.Figure or matplotlib.figure.Figure
+            To show, change or save.
+
+        Raises
+        ------
+        DfsmError
+            There is no such channel, run or engine, or Matplotlib is not installed.
+        """
+        return draw(self, channels, engine, run=run)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table of one line per run, model and channel: errors, and how rollouts ended."""
+        import pandas as pd
+
+        units = {c.name: (c.unit, c.role) for c in self.channels}
+        lines = []
+        for run in self.runs:
+            for model, m in run.models.items():
+                status = m.simulation.status.name.lower()
+                for name, (unit, role) in units.items():
+                    line = {"run": run.recorded.name, "model": model, "channel": name}
+                    line |= {"unit": unit, "role": role, "status": status}
+                    line["ended"] = m.simulation.ended
+                    error = m.errors.get(name)
+                    line |= dict.fromkeys(("rmse", "nrmse", "maximum"), None)
+                    line |= {} if error is None else asdict(error)
+                    line["coverage"] = m.coverage.get(name)
+                    lines.append(line | _beside(run.statistics.get(name), m.statistics.get(name)))
+        return pd.DataFrame(lines)
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values: all figures, without time series and spectra; None where not finite."""
         values = {
@@ -321,6 +375,18 @@ class Validation:
             "wall_time_s": self.wall_time(name),
             "speed_up": self.speed_up(name),
         }
+
+
+def _beside(
+    recorded: ChannelStatistics | None, simulated: ChannelStatistics | None
+) -> dict[str, float | None]:
+    """Mean and spread of a record and of a rollout, which has none if it ended early."""
+    sides = {"recorded": recorded, "simulated": simulated}
+    return {
+        f"{what}_{side}": None if s is None else getattr(s, what)
+        for side, s in sides.items()
+        for what in ("mean", "std")
+    }
 
 
 def _run_dict(run: RunComparison) -> dict[str, Any]:
