@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
-
-if TYPE_CHECKING:
-    from dfsm.data.trajectory import Trajectory
+from typing import Any, Literal
 
 Engine = Literal["plotly", "matplotlib"]
 
@@ -59,39 +56,3 @@ class Drawn(Shown):
             There is no such channel or engine, or Matplotlib is not installed.
         """
         return draw(self, channels, engine)
-
-
-class DrawnRun(Drawn):
-    """A simulated run, which can be drawn beside a recorded one."""
-
-    __slots__ = ()
-
-    def plot(
-        self,
-        channels: Sequence[str] | None = None,
-        *,
-        recorded: Trajectory | None = None,
-        engine: Engine = "plotly",
-    ) -> Any:
-        """Draw it.
-
-        Parameters
-        ----------
-        channels
-            Names to draw, in this order; None takes the first of the run.
-        recorded
-            A run to draw below it, where it holds the same channels.
-        engine
-            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
-
-        Returns
-        -------
-        plotly.graph_objects.Figure or matplotlib.figure.Figure
-            To show, change or save.
-
-        Raises
-        ------
-        DfsmError
-            There is no such channel or engine, or Matplotlib is not installed.
-        """
-        return draw(self, channels, engine, recorded=recorded)

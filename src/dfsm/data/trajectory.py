@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+__all__ = ["Channel", "Role", "Trajectory", "labels"]
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory(Drawn):
     """One simulation: channels sampled on one strictly increasing time mesh.

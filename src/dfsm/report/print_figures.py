@@ -190,7 +190,7 @@ def _curve(place: Axes, curve: Curve) -> None:
     if curve.style == "steps":
         place.step(curve.x, curve.y, where="mid", label=name, color=colour)
         return
-    if curve.style == "band":
+    if curve.style == "band" and curve.upper is not None:
         place.fill_between(
             curve.x,
             curve.y,

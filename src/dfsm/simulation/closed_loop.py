@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
-from dfsm.core.drawing import DrawnRun
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
+from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.loop import HostLoop, Path, roll_compiled
 from dfsm.simulation.loop_cases import ClosedLoopSettings, LoopCase, padded, prepared_cases
 from dfsm.simulation.simulate import ESCAPE, MUCH_OUTSIDE

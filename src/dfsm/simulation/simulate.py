@@ -15,7 +15,6 @@ from typing import Literal, get_args, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dfsm.core.drawing import DrawnRun
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
@@ -29,6 +28,7 @@ from dfsm.models.latents import latent_state
 from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import require_constant, require_field
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
+from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.fastest import REACH, fastest_rate
 from dfsm.simulation.integrate import (
     Case,

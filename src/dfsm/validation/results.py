@@ -319,20 +319,12 @@ class Validation(Drawn):
         """Return a table of one line per run, model and channel: errors, and how rollouts ended."""
         import pandas as pd
 
-        units = {c.name: (c.unit, c.role) for c in self.channels}
         lines = []
         for run in self.runs:
             for model, m in run.models.items():
-                status = m.simulation.status.name.lower()
-                for name, (unit, role) in units.items():
-                    line = {"run": run.recorded.name, "model": model, "channel": name}
-                    line |= {"unit": unit, "role": role, "status": status}
-                    line["ended"] = m.simulation.ended
-                    error = m.errors.get(name)
-                    line |= dict.fromkeys(("rmse", "nrmse", "maximum"), None)
-                    line |= {} if error is None else asdict(error)
-                    line["coverage"] = m.coverage.get(name)
-                    lines.append(line | _beside(run.statistics.get(name), m.statistics.get(name)))
+                for c in self.channels:
+                    at = {"run": run.recorded.name, "model": model, "channel": c.name}
+                    lines.append(at | {"unit": c.unit, "role": c.role} | _line(run, m, c.name))
         return pd.DataFrame(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -377,15 +369,21 @@ class Validation(Drawn):
         }
 
 
-def _beside(
-    recorded: ChannelStatistics | None, simulated: ChannelStatistics | None
-) -> dict[str, float | None]:
-    """Mean and spread of a record and of a rollout, which has none if it ended early."""
-    sides = {"recorded": recorded, "simulated": simulated}
+def _line(run: RunComparison, model: ModelRun, channel: str) -> dict[str, Any]:
+    """Figures of one channel; a rollout that ended early has neither errors nor statistics."""
+    error = model.errors.get(channel)
+    sides = {"recorded": run.statistics, "simulated": model.statistics}
+    figures = {side: of.get(channel) for side, of in sides.items()}
     return {
-        f"{what}_{side}": None if s is None else getattr(s, what)
-        for side, s in sides.items()
-        for what in ("mean", "std")
+        "status": model.simulation.status.name.lower(),
+        "ended": model.simulation.ended,
+        **{k: None if error is None else getattr(error, k) for k in ("rmse", "nrmse", "maximum")},
+        "coverage": model.coverage.get(channel),
+        **{
+            f"{what}_{side}": None if figure is None else getattr(figure, what)
+            for side, figure in figures.items()
+            for what in ("mean", "std")
+        },
     }
 
 
