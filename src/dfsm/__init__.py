@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from dfsm.data.wind_field import with_field_wind, with_harmonics
     from dfsm.errors import DfsmError, DfsmWarning
     from dfsm.exports.rosco import RoscoInput, write_rosco
+    from dfsm.exports.state_space import Linearization, StateSpaceModels, to_state_space
     from dfsm.fitting.corrective import NoCorrection
     from dfsm.fitting.corrective.gaussian_process import GP
     from dfsm.fitting.corrective.perceptron import MLP
@@ -199,6 +200,9 @@ _HOME = {
     "check_run": "control",
     "RoscoInput": "exports.rosco",
     "write_rosco": "exports.rosco",
+    "to_state_space": "exports.state_space",
+    "StateSpaceModels": "exports.state_space",
+    "Linearization": "exports.state_space",
     "write_report": "report",
     "write_solution_report": "report",
     "load_config": "config.fit",

@@ -19,6 +19,7 @@ import typer
 
 from dfsm.cli.closed_loop import closed_loop
 from dfsm.cli.control import check_run, export_rosco
+from dfsm.cli.export import exports
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
 from dfsm.cli.simulate import simulate
@@ -58,6 +59,7 @@ demos = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Studies that bring their own simulations."
 )
 app.add_typer(demos, name="demo")
+app.add_typer(exports, name="export")
 app.command()(simulate)
 app.command()(optimize)
 app.command("export-rosco")(export_rosco)

@@ -79,7 +79,7 @@ def steady_state(
     DfsmError
         The schedule value is missing or outside the training range.
     """
-    start = _operating_point(model, schedule)
+    start = operating_point(model, schedule)
     x, u, w, p = model.split(start)
     u = u if controls is None else jnp.asarray(controls, dtype=float)
     w = w if disturbances is None else jnp.asarray(disturbances, dtype=float)
@@ -122,7 +122,14 @@ def _rates(z: jax.Array, held: _Held) -> jax.Array:
     return held.model.derivative(states, *held.groups) / held.scale
 
 
-def _operating_point(model: DFSM, schedule: float | None) -> jax.Array:
+def operating_point(model: DFSM, schedule: float | None) -> jax.Array:
+    """Mean of the training runs at a schedule value, I = [u, w, ξ, p], shape ``(input,)``.
+
+    Raises
+    ------
+    DfsmError
+        The schedule value is missing or outside the training range.
+    """
     region, column = model.region, model.f.schedule
     if column is None:
         return region.mean
