@@ -141,6 +141,12 @@ VALID = {
     "Rotor": {"radius": 60.0, "wind": "w", "speed": "s", "pitch": "p"},
     "Product": {"factors": ("a", "b")},
     "Function": {"function": lambda x: x, "inputs": ("a",)},
+    "Goal": {"measure": "std", "channel": "x"},
+    "Limit": {"measure": "std", "channel": "x", "at_most": 1.0},
+    "TuningProblem": {
+        "parameters": {"kp": (0.0, 1.0)},
+        "objective": (dfsm.Goal(measure="std", channel="x"),),
+    },
 }
 
 

@@ -58,6 +58,9 @@ if TYPE_CHECKING:
     from dfsm.loops.load_cases import weibull_weights
     from dfsm.loops.regulator import linear_quadratic
     from dfsm.loops.sweep import Sweep, SweepSettings, sweep
+    from dfsm.loops.tuning import tune
+    from dfsm.loops.tuning_problem import Goal, Limit, TuneSettings, TuningProblem
+    from dfsm.loops.tuning_result import TuneStatus, TuningResult
     from dfsm.models.dfsm import DFSM
     from dfsm.models.model_folder import load, load_all, save
     from dfsm.models.signals import Azimuth
@@ -196,6 +199,13 @@ _HOME = {
     "Sweep": "loops.sweep",
     "SweepSettings": "loops.sweep",
     "weibull_weights": "loops.load_cases",
+    "tune": "loops.tuning",
+    "TuningProblem": "loops.tuning_problem",
+    "Goal": "loops.tuning_problem",
+    "Limit": "loops.tuning_problem",
+    "TuneSettings": "loops.tuning_problem",
+    "TuneStatus": "loops.tuning_result",
+    "TuningResult": "loops.tuning_result",
     "RunCheck": "control",
     "check_run": "control",
     "RoscoInput": "exports.rosco",

@@ -44,6 +44,7 @@ from dfsm.cli.terminal import (
     tell_notes,
     working,
 )
+from dfsm.cli.tune import tune
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, printable
@@ -67,6 +68,7 @@ app.command("check-run")(check_run)
 app.command()(calibrate)
 app.command()(wind)
 app.command("closed-loop")(closed_loop)
+app.command()(tune)
 
 
 @app.command()

@@ -66,7 +66,7 @@ def closed_loop(
     from dfsm.validation.closed_loop import validate_closed_loop
 
     settings = ClosedLoopSettings(start_up=start_up)
-    stand_ins = _pairs(measure or [])
+    stand_ins = pairs(measure or [])
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     output.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def closed_loop(
         for target in (*targets.values(), figures, *([report] if report else [])):
             check_file(target, [run.source for run in runs])
         sampled = runs[0].time_step
-        law = _controller(controller, library, interval or sampled)
+        law = controller_of(controller, library, interval or sampled)
         validation = validate_closed_loop(
             surrogate,
             runs,
@@ -110,8 +110,9 @@ def closed_loop(
         raise typer.Exit(1)
 
 
-def _pairs(texts: list[str]) -> dict[str, str]:
-    pairs = dict[str, str]()
+def pairs(texts: list[str]) -> dict[str, str]:
+    """Signal of the model by measurement, from ``NcIMURAys=PtfmPitch_dot_dot`` and the like."""
+    found = dict[str, str]()
     for text in texts:
         name, sign, signal = text.partition("=")
         if not (name and sign and signal):
@@ -119,11 +120,11 @@ def _pairs(texts: list[str]) -> dict[str, str]:
                 f"--measure is '{text}', expected a measurement and a signal of the model as in "
                 "NcIMURAys=PtfmPitch_dot_dot"
             )
-        pairs[name] = signal
-    return pairs
+        found[name] = signal
+    return found
 
 
-def _controller(text: str, library: Path | None, interval: float | None) -> Controller:
+def controller_of(text: str, library: Path | None, interval: float | None) -> Controller:
     """ROSCO, a library, or an object of a Python file."""
     path, sign, name = text.rpartition(":")
     if sign and path.endswith(".py"):

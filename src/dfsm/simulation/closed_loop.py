@@ -34,7 +34,7 @@ from dfsm.simulation.simulate import ESCAPE, MUCH_OUTSIDE
 from dfsm.simulation.wires import Wires, connect, not_commanded
 
 # Calls are padded to a multiple of this, so that runs of similar length share a compilation.
-_PAD = 400
+PAD = 400
 
 
 class LoopStatus(enum.Enum):
@@ -250,7 +250,7 @@ def _roller(model: DFSM, wires: Wires, controller: Controller) -> Callable[[Loop
     numbers = jax.tree.map(jnp.asarray, controller)
 
     def compiled(case: LoopCase) -> Path:
-        calls = -(-(len(case.drive.time) + 1) // _PAD) * _PAD
+        calls = -(-(len(case.drive.time) + 1) // PAD) * PAD
         return roll_compiled(model, wires, numbers, padded(case, calls))
 
     return compiled

@@ -90,44 +90,68 @@ def roll(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
     Path
         In which the first call of the controller comes at the first time.
     """
-    calls = len(drive.time)
-    steps = (len(drive.inputs) - 1) // 2
-    per_call = steps // calls
+    march = March(model, wires, drive)
+    call = jax.checkpoint(partial(march.call, controller))
+    (last, *_), out = jax.lax.scan(call, march.begin(controller), march.legs)
+    return march.path(last, out)
 
-    def by_call(values: jax.Array) -> jax.Array:
-        return values.reshape(calls, per_call, -1)
 
-    v = drive.inputs
-    legs = tuple(by_call(part) for part in wires.along(v))
-    fields = drive.field[:-1:per_call]
-    seen = wires.measured(model, drive.x0, v[0], (drive.psi0, drive.field[0]))
-    begun = _plain(controller.start(seen, wires.commands_of(v[0])))
-    first = v[0, jnp.array(wires.commanded)]
-    carry = (drive.x0, drive.psi0, first, begun)
+class March:
+    """One closed loop in its parts: how it begins, one call of the controller, what comes of it.
 
-    @jax.checkpoint
-    def call(carry: Any, drive: Any) -> tuple[Any, Any]:
+    Parameters
+    ----------
+    model, wires, drive
+        As for `roll`.
+    """
+
+    def __init__(self, model: DFSM, wires: Wires, drive: Drive) -> None:
+        self.model, self.wires, self.drive = model, wires, drive
+        self.calls = len(drive.time)
+        self.steps = (len(drive.inputs) - 1) // 2
+        self.per_call = self.steps // self.calls
+
+        def by_call(values: jax.Array) -> jax.Array:
+            return values.reshape(self.calls, self.per_call, -1)
+
+        legs = tuple(by_call(part) for part in wires.along(drive.inputs))
+        # What drives every call: its time, step, inputs and field.
+        self.legs = (drive.time, drive.h, legs, drive.field[: -1 : self.per_call])
+
+    def begin(self, controller: Any) -> tuple[Any, ...]:
+        """What the first call starts from: states, azimuth, controls set, controller's state."""
+        wires, drive, v = self.wires, self.drive, self.drive.inputs
+        seen = wires.measured(self.model, drive.x0, v[0], (drive.psi0, drive.field[0]))
+        begun = _plain(controller.start(seen, wires.commands_of(v[0])))
+        return (drive.x0, drive.psi0, v[0, jnp.array(wires.commanded)], begun)
+
+    def call(self, controller: Any, carry: Any, leg: Any) -> tuple[Any, Any]:
+        """One step of the controller, and the plant's until the next; states, commands, reads."""
+        model, wires = self.model, self.wires
         x, psi, held, state = carry
-        time, h, legs, field = drive
+        time, h, legs, field = leg
         seen = wires.measured(model, x, wires.with_commands(legs[0][0], held), (psi, field))
         new, commands = controller.step(state, seen, time)
         state, commands = _like(new, state), wires.in_model_units(_checked(commands, wires))
         path = []
-        for leg in range(per_call):
+        for step in range(self.per_call):
             path.append(x)
-            ends = tuple(wires.with_commands(part[leg], commands) for part in legs)
+            ends = tuple(wires.with_commands(part[step], commands) for part in legs)
             x, psi = _plant_step(model, x, psi, h, ends)
         return (x, psi, commands, state), (jnp.stack(path), commands, seen)
 
-    (last, *_), (xs, commands, seen) = jax.lax.scan(
-        call, carry, (drive.time, drive.h, legs, fields)
-    )
-    states = jnp.concatenate([xs.reshape(steps, -1), last[None]])
-    commands = jnp.repeat(commands, per_call, axis=0)
-    inputs = wires.with_commands(v[::2], jnp.concatenate([commands, commands[-1:]]))
-    h = jnp.repeat(drive.h, per_call)
-    outputs, outside = observe(model, h, states, (inputs, drive.field), drive.psi0)
-    return Path(states, inputs[:, : len(model.signals.controls)], outputs, outside, seen)
+    def path(self, last: jax.Array, out: tuple[jax.Array, jax.Array, jax.Array]) -> Path:
+        """Put together what all calls gave."""
+        xs, commands, seen = out
+        model, drive = self.model, self.drive
+        states = jnp.concatenate([xs.reshape(self.steps, -1), last[None]])
+        commands = jnp.repeat(commands, self.per_call, axis=0)
+        inputs = self.wires.with_commands(
+            drive.inputs[::2], jnp.concatenate([commands, commands[-1:]])
+        )
+        h = jnp.repeat(drive.h, self.per_call)
+        outputs, outside = observe(model, h, states, (inputs, drive.field), drive.psi0)
+        return Path(states, inputs[:, : len(model.signals.controls)], outputs, outside, seen)
 
 
 def _plant_step(

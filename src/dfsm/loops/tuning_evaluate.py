@@ -1,0 +1,233 @@
+"""Figures of closed loops over all runs and their exact slopes, for values of the parameters."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.controllers.gains import with_numbers
+from dfsm.controllers.tunable import Tunable
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+from dfsm.loops.measures import Measure
+from dfsm.models.completion import all_completed
+from dfsm.models.dfsm import DFSM
+from dfsm.simulation.closed_loop import (
+    PAD,
+    ClosedLoopRun,
+    LoopStatus,
+    is_compiled,
+    result_of,
+)
+from dfsm.simulation.loop import roll_compiled
+from dfsm.simulation.loop_cases import ClosedLoopSettings, LoopCase, padded, prepared_cases
+from dfsm.simulation.loop_slopes import roll_with_slopes
+from dfsm.simulation.wires import connect
+
+
+@dataclass(frozen=True, eq=False)
+class Figured:
+    """Figures of the loops at one point.
+
+    Attributes
+    ----------
+    theta
+        Values of the parameters, shape ``(parameter,)``.
+    figures
+        Shape ``(measure, run)``; not a number where a loop ended early.
+    slopes
+        Shape ``(measure, run, parameter)``; None where they were not asked for.
+    endings
+        One sentence per loop that ended early.
+    """
+
+    theta: Array
+    figures: Array
+    slopes: Array | None
+    endings: tuple[str, ...]
+
+    @property
+    def stable(self) -> bool:
+        """Whether every loop came to its end."""
+        return not self.endings
+
+
+class Evaluator:
+    """Closed loops of a tunable controller on a model over some runs.
+
+    What was computed once is not computed again, in a later call with the same journal neither: an
+    optimization that was interrupted goes on where it stood.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    runs
+        What drives it.
+    tuned
+        The controller with its free parameters.
+    measures
+        What is asked of each loop.
+    window
+        Start and stop of what is scored in s.
+    loop
+        How loops are closed.
+    measurements
+        As for `closed_loop`.
+
+    Raises
+    ------
+    DfsmError
+        As `closed_loop`; or a controller that JAX cannot follow.
+    """
+
+    def __init__(
+        self,
+        model: DFSM,
+        runs: Sequence[Trajectory],
+        tuned: Tunable,
+        measures: Sequence[Measure],
+        *,
+        window: tuple[float | None, float | None] = (None, None),
+        loop: ClosedLoopSettings | None = None,
+        measurements: Mapping[str, str] | None = None,
+    ) -> None:
+        if not is_compiled(tuned.controller):
+            raise DfsmError(
+                f"{type(tuned.controller).__name__} is no equinox module, so JAX cannot "
+                "differentiate it: write it as one, or tune ROSCO in JAX instead of a library"
+            )
+        self.model, self.tuned, self.measures = model, tuned, tuple(measures)
+        self.runs = all_completed(list(runs), model.signals)
+        self.wires = connect(model, tuned.controller, measurements)
+        settings = loop or ClosedLoopSettings()
+        interval = float(tuned.controller.interval)
+        self.cases = prepared_cases(model, self.runs, interval, window, settings)
+        longest = max(len(c.drive.time) for c in self.cases) + 1
+        calls = -(-longest // PAD) * PAD
+        self._drives = [padded(case, calls) for case in self.cases]
+        self._controller = jax.tree.map(jnp.asarray, tuned.controller)
+        self._known: dict[tuple[float, ...], Figured] = {}
+        self._journal: Path | None = None
+        self.evaluations = self.gradients = 0
+
+    def keep(self, journal: Path) -> None:
+        """Take over what a journal holds, one evaluation a line, and add to it from now on."""
+        if journal.exists():
+            lines = journal.read_text(encoding="utf-8").splitlines()[1:]
+            for line in lines:
+                if (found := _from_line(line)) is not None:
+                    self._known[tuple(found.theta.tolist())] = found
+        self._journal = journal
+
+    def __call__(self, theta: Array, slopes: bool = False) -> Figured:
+        """Figures at a point, and their slopes if asked for."""
+        key = tuple(float(t) for t in theta)
+        known = self._known.get(key)
+        if known is not None and (known.slopes is not None or not slopes or not known.stable):
+            return known
+        self.evaluations += 1
+        self.gradients += slopes
+        numbers = self.tuned.numbers(list(jnp.asarray(theta)))
+        ways = self.tuned.directions(np.asarray(theta)) if slopes else None
+        indices = range(len(self.cases))
+        # XLA keeps a loop on one core.
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            done = list(pool.map(lambda i: self._run(i, numbers, ways), indices))
+        found = Figured(
+            np.array(key),
+            np.array([d[0] for d in done]).T.reshape(len(self.measures), -1),
+            np.stack([d[1] for d in done], axis=1) if slopes else None,
+            tuple(d[2] for d in done if d[2]),
+        )
+        self._known[key] = found
+        if self._journal is not None:
+            with self._journal.open("a", encoding="utf-8") as stream:
+                stream.write(_line(found))
+        return found
+
+    def loops(self, theta: Array) -> list[ClosedLoopRun]:
+        """The closed loops themselves at a point."""
+        controller = self.tuned.at(theta)
+        numbers = jax.tree.map(jnp.asarray, controller)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            paths = list(
+                pool.map(lambda d: roll_compiled(self.model, self.wires, numbers, d), self._drives)
+            )
+        return [
+            result_of(self.model, self.wires, controller, case, path)
+            for case, path in zip(self.cases, paths, strict=True)
+        ]
+
+    def _run(
+        self, i: int, numbers: dict[str, jax.Array], ways: list[dict[str, jax.Array]] | None
+    ) -> tuple[list[float], Array, str]:
+        """Figures of one run, their slopes, and how it ended if it did so early."""
+        case, drive = self.cases[i], self._drives[i]
+        controller, moved = self._controller, None
+        if ways is None:
+            path = roll_compiled(self.model, self.wires, with_numbers(controller, numbers), drive)
+        else:
+            path, moved = roll_with_slopes(self.model, self.wires, controller, numbers, ways, drive)
+        ended = result_of(self.model, self.wires, controller, case, path)
+        nothing = np.full((len(self.measures), len(self.tuned.names)), np.nan)
+        if ended.status is not LoopStatus.COMPLETED:
+            told = f"{ended.trajectory.name}: {ended.message}"
+            return [np.nan] * len(self.measures), nothing, told
+        return *self._figures(case, ended.trajectory, moved), ""
+
+    def _figures(
+        self, case: LoopCase, run: Trajectory, moved: jax.Array | None
+    ) -> tuple[list[float], Array]:
+        s = self.model.signals
+        shown = [c.name for c in (*s.observed, *s.controls, *s.outputs)]
+        figures, slopes = [], np.zeros((len(self.measures), len(self.tuned.names)))
+        ways = None
+        if moved is not None:
+            steps = np.asarray(moved)[:, : case.rows]
+            ways = [case.sampled(way)[case.scored :] for way in steps]
+        for m, measure in enumerate(self.measures):
+            figure, along = measure.along(run.time, run[measure.channel])
+            figures.append(figure)
+            if ways is not None:
+                column = shown.index(measure.channel)
+                slopes[m] = [along @ way[:, column] for way in ways]
+        return figures, slopes
+
+
+def _line(found: Figured) -> str:
+    values: dict[str, Any] = {
+        "theta": found.theta.tolist(),
+        "figures": None if found.endings else found.figures.tolist(),
+        "slopes": None if found.slopes is None or found.endings else found.slopes.tolist(),
+        "endings": list(found.endings),
+        "shape": list(found.figures.shape),
+    }
+    return json.dumps(values) + "\n"
+
+
+def _from_line(line: str) -> Figured | None:
+    """What a line holds; None for the one in whose middle a process was ended."""
+    try:
+        values = json.loads(line)
+        shape = tuple(values["shape"])
+        figures = np.full(shape, np.nan) if values["figures"] is None else values["figures"]
+        slopes = None if values["slopes"] is None else np.array(values["slopes"], dtype=float)
+        return Figured(
+            np.array(values["theta"], dtype=float),
+            np.array(figures, dtype=float),
+            slopes,
+            tuple(values["endings"]),
+        )
+    except (ValueError, KeyError, TypeError):
+        return None

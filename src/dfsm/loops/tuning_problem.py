@@ -1,0 +1,197 @@
+"""What a tuning is asked: parameters and their bounds, objective, constraints, over which runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dfsm.core.settings import require, settings_class
+from dfsm.core.types import Array
+from dfsm.errors import DfsmError, missing
+from dfsm.loops.measures import Measure
+from dfsm.models.dfsm import DFSM
+from dfsm.simulation.loop_cases import ClosedLoopSettings
+
+
+@settings_class
+class Goal(Measure):
+    """A term of the objective: a measure, its weight, and what it is divided by.
+
+    Attributes
+    ----------
+    measure, channel, exponent, reference
+        See `Measure`.
+    weight
+        Above 0 to make the measure small, below 0 to make it large.
+    scale
+        What the measure is divided by; None takes its value with the controller as it is.
+    """
+
+    weight: float = 1.0
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            bool(np.isfinite(self.weight)) and self.weight != 0,
+            f"weight of {self.label}",
+            self.weight,
+            "a number that is not 0",
+        )
+        require(self.scale is None or self.scale > 0, "scale", self.scale, "more than 0")
+
+
+@settings_class
+class Limit(Measure):
+    """A constraint: a measure that may not pass a value; of extremes in every run.
+
+    Attributes
+    ----------
+    measure, channel, exponent, reference
+        See `Measure`.
+    at_most, at_least
+        One of them, in the unit of the measure.
+    """
+
+    at_most: float | None = None
+    at_least: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one = (self.at_most is None) != (self.at_least is None)
+        require(one, f"limit of {self.label}", "missing or double", "at_most or at_least")
+
+    @property
+    def bound(self) -> float:
+        """The value that may not be passed."""
+        return float(self.at_most if self.at_most is not None else self.at_least)  # pyright: ignore[reportArgumentType]
+
+    def excess(self, value: float | Array) -> float | Array:
+        """How far a value is beyond, as a share of the limit; negative within."""
+        size = abs(self.bound) or 1.0
+        return (value - self.bound) / size * self.sign
+
+    @property
+    def sign(self) -> float:
+        """1 for an upper limit, -1 for a lower one."""
+        return 1.0 if self.at_most is not None else -1.0
+
+
+@settings_class
+class TuningProblem:
+    """What is tuned, and for what.
+
+    Attributes
+    ----------
+    parameters
+        Lowest and highest value by name, see `dfsm.controllers.tunable`.
+    objective
+        Terms, added up: Σ weight · measure / scale.
+    constraints
+        What may not be passed.
+    weights
+        Share of the time that each run stands for, see `weibull_weights`; None for equal shares.
+
+    Raises
+    ------
+    DfsmError
+        No parameters, no objective, bounds the wrong way round, or weights that are not positive.
+    """
+
+    parameters: Mapping[str, tuple[float, float]]
+    objective: Sequence[Goal]
+    constraints: Sequence[Limit] = ()
+    weights: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        require(bool(self.parameters), "parameters", "empty", "at least one, with its bounds")
+        require(bool(self.objective), "objective", "empty", "at least one term")
+        for name, (low, high) in self.parameters.items():
+            finite = bool(np.isfinite([low, high]).all())
+            require(
+                finite and low < high,
+                f"bounds of {name}",
+                (low, high),
+                "two numbers, the lower one first",
+            )
+            if name == "ps_percent":
+                require(low > 0 and high <= 1, f"bounds of {name}", (low, high), "shares up to 1")
+            elif name in ("omega_pc", "zeta_pc", "omega_vs", "zeta_vs"):
+                require(low > 0, f"bounds of {name}", (low, high), "numbers above 0")
+        if self.weights is not None:
+            require(min(self.weights) > 0, "weights", list(self.weights), "numbers above 0")
+
+    @property
+    def measures(self) -> tuple[Measure, ...]:
+        """Of objective and constraints, in this order."""
+        return (*self.objective, *self.constraints)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest values of the parameters."""
+        low, high = zip(*self.parameters.values(), strict=True)
+        return np.array(low, dtype=float), np.array(high, dtype=float)
+
+
+@settings_class
+class TuneSettings:
+    """How to tune.
+
+    Attributes
+    ----------
+    start, stop
+        Time window in s that is scored.
+    loop
+        How loops are closed.
+    starts
+        Starting points: the controller as it is, and others spread over the bounds.
+    seed
+        Of these.
+    iterations
+        Most steps from each start.
+    tolerance
+        Of the optimizer, in shares of the objective.
+    pareto
+        Number of weights between two terms of the objective, for their Pareto front; 0 for none.
+    """
+
+    start: float | None = None
+    stop: float | None = None
+    loop: ClosedLoopSettings = ClosedLoopSettings()
+    starts: int = 1
+    seed: int = 0
+    iterations: int = 40
+    tolerance: float = 1e-5
+    pareto: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.starts >= 1, "starts", self.starts, "at least 1")
+        require(self.seed >= 0, "seed", self.seed, "0 or more")
+        require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
+        require(0 < self.tolerance < 1, "tolerance", self.tolerance, "between 0 and 1")
+        require(self.pareto == 0 or self.pareto >= 2, "pareto", self.pareto, "0, or at least 2")
+
+
+def check_problem(problem: TuningProblem, model: DFSM, runs: int, settings: TuneSettings) -> None:
+    """Refuse a problem that does not fit the model or the runs.
+
+    Raises
+    ------
+    DfsmError
+        A channel that the model does not have, weights that are not one per run, or a Pareto front
+        of other than two terms.
+    """
+    s = model.signals
+    known = [c.name for c in (*s.observed, *s.controls, *s.outputs)]
+    if lost := list(dict.fromkeys(m.channel for m in problem.measures if m.channel not in known)):
+        raise DfsmError(
+            f"objective and constraints: the model has {missing(lost, known)} (an output is added "
+            "by fitting the model with it)"
+        )
+    if problem.weights is not None:
+        count = len(problem.weights)
+        require(count == runs, "weights", list(problem.weights), f"one per run, {runs}")
+    if settings.pareto:
+        count = len(problem.objective)
+        require(count == 2, "terms of the objective", count, "two for a Pareto front")
