@@ -58,7 +58,7 @@ def test_damage_has_its_slope_at_fixed_cycles():
     load = np.convolve(rng.normal(size=900), np.ones(9) / 9, "same")
     peak = int(np.argmax(load))
     closed = np.concatenate([load[peak:], load[: peak + 1]])
-    ranges = fatpack.find_rainflow_ranges(closed, k=2**20)
+    ranges = np.asarray(fatpack.find_rainflow_ranges(closed, k=2**20))
     for m in (3.0, 10.0):
         value, slope = damage_with_slope(load, 90.0, m)
         assert value == pytest.approx((np.sum(ranges**m) / 90.0) ** (1 / m), rel=1e-5)

@@ -149,7 +149,7 @@ class TuningResult:
             return ""
         limits = self.problem.constraints
         values = self.figures[len(self.problem.objective) :]
-        k = int(np.argmax([c.excess(v) for c, v in zip(limits, values, strict=True)]))
+        k = int(np.argmax([float(c.excess(v)) for c, v in zip(limits, values, strict=True)]))
         return f"{limits[k].label} is {values[k]:.4g}, its limit {limits[k].bound:g}"
 
     def summary(self) -> str:
