@@ -13,6 +13,7 @@ from dfsm.config.parse import Strict, parse_file
 from dfsm.control import DirectTranscription, OptimalControlProblem
 from dfsm.control.mesh.schemes import Kind
 from dfsm.control.names import GROUPS, Plant, plant_of
+from dfsm.data.between import Between
 from dfsm.data.readers import read_all
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
@@ -71,6 +72,8 @@ class ControlConfig(Strict):
         ``free`` within the bounds, or ``recorded`` in the run.
     scheme, nodes, refine, tolerance, most_iterations, most_seconds, stay_inside
         See `DirectTranscription`; `nodes` are those of the first mesh, intervals plus one.
+    inputs
+        What inputs do between nodes and samples, see `OptimalControlProblem`.
     name
         For messages.
     """
@@ -91,6 +94,7 @@ class ControlConfig(Strict):
     most_iterations: int = DirectTranscription.most_iterations
     most_seconds: float | None = None
     stay_inside: bool = False
+    inputs: Between | dict[str, Between] | None = None
     name: str | None = None
 
 
@@ -132,6 +136,7 @@ def load_problem(
             parameters=config.parameters,
             initial=_initial(config, model, runs),
             disturbances=runs or None,
+            inputs=config.inputs,
             name=config.name or path.stem,
         )
     except DfsmError as error:

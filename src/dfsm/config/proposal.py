@@ -8,12 +8,13 @@ a proposal; a reason stands beside each so that a reader can confirm it or not.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.data.between import recognised
 from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
 
@@ -52,6 +53,8 @@ class Proposal:
         The turbine's wind, along which its linear fit varies.
     turbine
         Whether the channels are those of a wind turbine.
+    held
+        Controls and disturbances that stay and jump, and so are held between samples.
     """
 
     states: list[dict[str, Any]]
@@ -63,6 +66,7 @@ class Proposal:
     reasons: dict[str, str] = field(default_factory=dict)
     wind: str | None = None
     turbine: bool = False
+    held: tuple[str, ...] = ()
 
 
 def propose(
@@ -81,9 +85,17 @@ def propose(
     rates = _rates(runs[0], varying)
     for name, base in rates.items():
         reasons[name] = f"rate of {base}"
+    kinds = recognised(runs, varying)
+    held = [n for n, kind in zip(varying, kinds, strict=True) if kind == "hold"]
     if _TURBINE & set(varying):
-        return _of_turbine(varying, list(parameters), rates, reasons)
-    return _of_anything(runs[0], varying, list(parameters), rates, reasons)
+        proposed = _of_turbine(varying, list(parameters), rates, reasons)
+    else:
+        reasons |= dict.fromkeys(held, "control: it stays and jumps, as what is held does")
+        proposed = _of_anything(runs[0], varying, list(parameters), rates, reasons)
+        names = [n for n in varying if n in {*held, *proposed.controls}]
+        proposed = replace(proposed, controls=names)
+    driving = {*proposed.controls, *proposed.disturbances}
+    return replace(proposed, held=tuple(n for n in held if n in driving))
 
 
 def _of_turbine(
@@ -133,6 +145,8 @@ def _of_anything(
     first = np.gradient(table, time, axis=0)
     second = np.gradient(first, time, axis=0)
     for i, name in enumerate(names):
+        if name in reasons:
+            continue
         others = np.delete(table, i, axis=1)
         known = next((r for r, base in rates.items() if base == name), None)
         once = _explained(first[:, i], table)

@@ -49,6 +49,10 @@ signals:
   parameters: {parameters}
   outputs: {outputs}
 
+# What controls and disturbances do between samples: hold, linear or cubic, for all or by name.
+# Those that stay and jump are recognised as held.
+inputs: {inputs}
+
 derivatives:
   method: smoothing_spline     # or cubic_spline, as in the paper
   # filters: {{{state}: {{kind: low_pass, cutoff: 0.5}}}}
@@ -147,6 +151,7 @@ def fill(
         terms="rotor, quadratic_drag, product" if turbine else "quadratic_drag, product",
         parameters=_flow(proposed.parameters),
         outputs=_flow(proposed.outputs),
+        inputs=_flow(dict.fromkeys(proposed.held, "hold")) if proposed.held else "null",
         linear=linear,
         corrective=_NO_CORRECTION if turbine else _CORRECTION,
         azimuth=_azimuth(states, varying, turbine),

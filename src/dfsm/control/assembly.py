@@ -11,12 +11,13 @@ import numpy as np
 from dfsm.control.chatter import chattering
 from dfsm.control.diagnose import conflict, require_finite, runaway, worst_violation
 from dfsm.control.guess import Start
+from dfsm.control.levels import level
 from dfsm.control.meshes import Record
 from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.shot import Shot
 from dfsm.control.nlp.transcription import node_data
-from dfsm.control.problem import OptimalControlProblem, level
+from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.replay import replay
 from dfsm.control.solution import HELD, RATE, Ending, Solution
 from dfsm.core.types import Array

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.control.between import require_followed, tell_of_held
 from dfsm.control.diagnose import require_finite, worst_violation
 from dfsm.control.guess import Start, start_of
 from dfsm.control.mesh.grid import Grid
@@ -21,6 +22,7 @@ from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Solution
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
+from dfsm.models.dfsm import DFSM
 
 # Outcomes of the solver that can be built on.
 _GOOD = ("solved", "acceptable", "stalled")
@@ -130,7 +132,7 @@ def solve_meshes(
     tolerance = max(method.tolerance, _ROUGHLY) if on_the_way else method.tolerance
     settings = SolverSettings(tolerance, method.most_iterations, until=until)
     refine = None if on_the_way else method.refine
-    record, grid = Record(tolerance), method.grid()
+    record, grid = Record(tolerance), _first_grid(problem, method)
     record = _from_guess(record, problem, method, grid, guess, settings)
     if refine is None:
         return record
@@ -141,6 +143,15 @@ def solve_meshes(
         grid = grid.finer(_FINER)
         record = _from_guess(record, problem, method, grid, guess, settings)
     return _refined(record, problem, method, refine, settings)
+
+
+def _first_grid(problem: OptimalControlProblem, method: Method) -> Grid:
+    """The first mesh, on which controls are held that are to be."""
+    grid, model = method.grid(), problem.model
+    own = model.signals.between if isinstance(model, DFSM) else ()
+    require_followed(grid, problem.plant, problem.between, problem.free_time is not None)
+    tell_of_held(problem.plant, own, problem.inputs)
+    return grid.holding() if problem.holds_controls else grid
 
 
 def _from_guess(

@@ -12,13 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
+from dfsm.control.between import kinds_of
+from dfsm.control.levels import Constraint, Interval, Level, is_number, level
 from dfsm.control.names import GROUPS, Plant, plant_of
 from dfsm.core.settings import require
 from dfsm.core.types import Array
+from dfsm.data.between import Between, Chosen
 from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
@@ -26,11 +29,6 @@ from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_state, latents_at, poles
 from dfsm.simulators import ODESystem
-
-# A number, None for no limit, a function of time (array in, array out), or a run with the channel.
-Level = float | None | Callable[[Array], Any] | Trajectory
-Interval = tuple[Level, Level]
-Constraint = tuple[Callable[..., Any], Level, Level]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,10 +67,16 @@ class OptimalControlProblem:
     parameters
         ``name: value`` fixes a plant parameter, ``name: (low, high)`` leaves it to the optimizer.
     disturbances
-        Known over the whole horizon, linear between samples. Several runs are several scenarios:
-        each has its own states and controls, all share the free parameters and the final time.
+        Known over the whole horizon, between samples as `inputs` say. Several runs are several
+        scenarios: each has its own states and controls, all share the free parameters and the
+        final time.
     weights
         Of the scenarios in the cost; None weighs all the same. They are scaled to a sum of 1.
+    inputs
+        What inputs do in between, ``"hold"``, ``"linear"`` or ``"cubic"``, for all or by name.
+        Disturbances that are not named do between samples as the model says, or are lines. Controls
+        follow the scheme's polynomials, or are held over every interval of the first mesh if this
+        says hold. What is held needs the scheme radau.
     name
         For messages.
 
@@ -95,6 +99,7 @@ class OptimalControlProblem:
     parameters: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     disturbances: Trajectory | Sequence[Trajectory] | None = None
     weights: Sequence[float] | None = None
+    inputs: Chosen = None
     name: str = "problem"
 
     def __post_init__(self) -> None:
@@ -105,6 +110,7 @@ class OptimalControlProblem:
         _check_horizon(self)
         _check_disturbances(self)
         _check_limits(self)
+        _ = self.between
         if self.cost is None and self.final_cost is None:
             raise DfsmError(f"{self.name}: nothing to minimise: give a cost or a final_cost")
         if self.weights is not None:
@@ -160,6 +166,17 @@ class OptimalControlProblem:
             whole = all(n in run for n in self.plant.names("disturbances"))
             return completed(run, self.model.signals, compute=not whole)
         return in_units_of(run, [c for group in self.plant.channels.values() for c in group])
+
+    @cached_property
+    def between(self) -> tuple[Between, ...]:
+        """What controls and disturbances, in this order, do between nodes and samples."""
+        own = self.model.signals.between if isinstance(self.model, DFSM) else ()
+        return kinds_of(self.inputs, self.plant, own, self.name)
+
+    @property
+    def holds_controls(self) -> bool:
+        """Whether controls are held over the intervals of the first mesh."""
+        return "hold" in self.between[: len(self.plant.names("controls"))]
 
     @property
     def latents(self) -> tuple[str, ...]:
@@ -231,48 +248,6 @@ class OptimalControlProblem:
             return float(limits), float(limits)
         low, high = limits
         return (-np.inf if low is None else float(low), np.inf if high is None else float(high))
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value is one number, and not a pair."""
-    return isinstance(value, int | float | np.number)
-
-
-def level(limit: Level, name: str, time: Array, default: float) -> Array:
-    """Evaluate a limit at times in s.
-
-    Parameters
-    ----------
-    limit
-        See `OptimalControlProblem.bounds`.
-    name
-        Channel to take from a run.
-    time
-        Shape ``(time,)``.
-    default
-        Stands for None.
-
-    Returns
-    -------
-    ndarray
-        Shape ``(time,)``.
-
-    Raises
-    ------
-    DfsmError
-        The limit gives another number of values.
-    """
-    if limit is None:
-        return np.full(len(time), default)
-    if isinstance(limit, Trajectory):
-        return limit.select([name]).resample(time).values[:, 0]
-    value = np.asarray(limit(time) if callable(limit) else limit, dtype=np.float64)
-    if value.shape not in ((), np.shape(time)):
-        raise DfsmError(
-            f"a limit of '{name}' has shape {value.shape} at {len(time)} times: a function of time "
-            "takes an array and returns one number or one per time"
-        )
-    return np.broadcast_to(value, np.shape(time)).copy()
 
 
 # -- checks -------------------------------------------------------------------------------------

@@ -16,12 +16,15 @@ from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Replay
 from dfsm.core.types import Array
+from dfsm.data.between import polynomials
 from dfsm.data.trajectory import Trajectory
 
 TOLERANCE = 1e-9
 _MOST_STEPS = 100_000
 # Intervals are padded to a multiple of this, so that meshes share a compilation.
 _PAD = 256
+# Share of an interval within which an edge is met.
+_EDGE = 1e-9
 
 
 def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: int) -> Replay:
@@ -90,12 +93,22 @@ def _pieces(grid: Grid, U: Array) -> dict[str, Array]:
     }
 
 
-def _table(problem: OptimalControlProblem, scenario: int) -> tuple[Array, Array]:
-    """Times of the disturbances' samples, and these."""
+def _table(problem: OptimalControlProblem, scenario: int) -> tuple[Array, ...]:
+    """Times of the disturbances' samples, and these; polynomials if not all are lines."""
     names, run = problem.plant.names("disturbances"), problem.scenarios[scenario]
     if run is None or not names:
         return np.zeros(2), np.zeros((2, 0))
-    return run.time, run.select(names).values
+    kinds = problem.between[len(problem.plant.names("controls")) :]
+    values = run.select(names).values
+    if set(kinds) == {"linear"}:
+        return run.time, values
+    return run.time, values, polynomials(run.time, values, kinds)
+
+
+def _on_polynomials(t: jax.Array, times: Array, polynomial: Array) -> jax.Array:
+    k = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    s = t - jnp.asarray(times)[k]
+    return s ** jnp.arange(3, -1, -1) @ jnp.asarray(polynomial)[:, k]
 
 
 @eqx.filter_jit
@@ -105,7 +118,7 @@ def _integrate(
     x0: Array,
     size: Array,
     p: jax.Array,
-    disturbances: tuple[Array, Array],
+    disturbances: tuple[Array, ...],
     horizon: Array,
     points: Array,
 ) -> jax.Array:
@@ -113,12 +126,17 @@ def _integrate(
     import diffrax
 
     begin, duration = jnp.asarray(horizon)
-    times, values = disturbances
+    times, values, *polynomial = disturbances
 
     def slope(theta: jax.Array, z: jax.Array, piece: dict[str, jax.Array]) -> jax.Array:
         powers = theta ** jnp.arange(len(points))
-        t = begin + (piece["begin"] + theta * piece["length"]) * duration
-        w = jax.vmap(lambda v: jnp.interp(t, times, v), 1)(jnp.asarray(values))
+        # What jumps at an edge is on this side of it.
+        inside = jnp.clip(theta, _EDGE, 1 - _EDGE) if polynomial else theta
+        t = begin + (piece["begin"] + inside * piece["length"]) * duration
+        if polynomial:
+            w = _on_polynomials(t, times, polynomial[0])
+        else:
+            w = jax.vmap(lambda v: jnp.interp(t, times, v), 1)(jnp.asarray(values))
         f = derivative(z * size, powers @ piece["controls"], w, p)
         return f * piece["length"] * duration / size
 

@@ -67,6 +67,8 @@ def save_solution(
         "edges": solution.grid.edges,
         "solver_state": solution.solver_state,
     }
+    if solution.grid.held is not None:
+        tensors["held"] = solution.grid.held
     for group in ("multipliers", "bounds"):
         arrays = getattr(solution, group)
         tensors |= {f"{group}/{n}": np.asarray(v) for n, v in arrays.items()}
@@ -123,7 +125,7 @@ def load_solution(path: str | Path) -> Solution:
         solution = Solution(
             **plain,
             ending=Ending[manifest["ending"]],
-            grid=Grid(**manifest["scheme"], edges=tensors["edges"]),
+            grid=Grid(**manifest["scheme"], edges=tensors["edges"], held=tensors.get("held")),
             trajectories=tuple(_together("trajectories", manifest, tensors)),
             costates=tuple(_together("costates", manifest, tensors)),
             multipliers=_group("multipliers/", tensors),
@@ -199,6 +201,10 @@ def _check(solution: Solution) -> None:
     edges = grid.edges
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise ValueError("edges, expected at least two that increase")
+    held = edges if grid.held is None else grid.held
+    ends = held.ndim == 1 and len(held) > 1 and (held[0], held[-1]) == (edges[0], edges[-1])
+    if not ends or not np.isin(held, edges).all() or not (np.diff(held) > 0).all():
+        raise ValueError("held, expected some of the edges")
     nodes = steps[grid.kind] * (len(edges) - 1) + 1
     if not runs or any(len(run) != nodes for run in runs):
         raise ValueError(f"scheme, whose {nodes} nodes are not those of the trajectories")

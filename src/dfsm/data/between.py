@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -29,6 +29,9 @@ _STAYS = 0.5
 # Of its moves at most this share goes on in the direction of the one before: a signal that leaves a
 # limit and comes back moves on for many samples.
 _GOES_ON = 0.35
+# A signal is rough that turns at so many of its samples, and has such a share of its variance above
+# a quarter of the sampling rate; and the fewest samples that tell.
+_TURNS, _FAST, _FEWEST = 0.5, 0.15, 30
 # A slow signal that is rounded stays and moves by one unit of its rounding, over so many levels.
 _ROUNDED = 20
 
@@ -44,6 +47,60 @@ def is_held(values: Array) -> bool:
     if goes_on.sum() > _GOES_ON * len(moves):
         return False
     return bool(np.ptp(values) < _ROUNDED * np.median(np.abs(moves)))
+
+
+class Roughness(NamedTuple):
+    """How rough samples are.
+
+    Attributes
+    ----------
+    turns
+        Share of the samples at which the slope changes its sign.
+    fast
+        Share of the variance above a quarter of the sampling rate.
+    """
+
+    turns: float
+    fast: float
+
+    @property
+    def rough(self) -> bool:
+        """Whether no spline knows what is between the samples."""
+        return self.turns >= _TURNS and self.fast >= _FAST
+
+
+def roughness(values: Array) -> Roughness:
+    """Judge equidistant samples ``(time,)``."""
+    if len(values) < _FEWEST or not np.ptp(values) > 0:
+        return Roughness(0.0, 0.0)
+    steps = np.diff(values)
+    # Tapered, for an offset of the ends is all frequencies.
+    tapered = (values - values.mean()) * np.hanning(len(values))
+    power = np.abs(np.fft.rfft(tapered)) ** 2
+    fast = power[len(power) // 2 :].sum() / power.sum()
+    return Roughness(float(np.mean(steps[1:] * steps[:-1] < 0)), float(fast))
+
+
+def rough_ones(
+    runs: Sequence[Trajectory], names: Sequence[str], kinds: Sequence[Between]
+) -> tuple[str, ...]:
+    """Inputs that are joined by lines and turn at nearly every sample, in all runs that they vary.
+
+    Parameters
+    ----------
+    runs
+        The samples that count.
+    names, kinds
+        Inputs, and what they do between samples.
+    """
+    rough = []
+    for name, kind in zip(names, kinds, strict=True):
+        moving = [run for run in runs if np.ptp(run[name]) > 0]
+        even = all(not same_instant(run.time).any() for run in moving)
+        if kind == "linear" and moving and even:
+            found = [roughness(run[name]).rough for run in moving]
+            rough += [name] if all(found) else []
+    return tuple(rough)
 
 
 def recognised(runs: Iterable[Trajectory], names: Sequence[str]) -> tuple[Between, ...]:

@@ -1,7 +1,8 @@
 """Optimal torque and pitch as an open-loop input file of ROSCO, to be repeated in OpenFAST.
 
-ROSCO (`OL_Mode = 1`) joins the rows by straight lines. Before the first row its own controllers are
-at work, so that a horizon which begins at 100 s leaves 100 s for the turbine to settle.
+ROSCO (`OL_Mode = 1`) joins the rows by straight lines; where a control is held and jumps, two rows
+stand close together. Before the first row its own controllers are at work, so that a horizon which
+begins at 100 s leaves 100 s for the turbine to settle.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from dfsm.exports.rosco_limits import (
 
 # More rows than this are a mistyped step.
 _MOST_ROWS = 1_000_000
+# Time in s between the two rows at which a held control jumps: less than a step of a controller.
+_JUMP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def write_rosco(
         Which one, counted from 1.
     step
         Time between rows in s, the controls in between by the scheme's polynomials; None writes
-        the nodes of the solution.
+        the nodes of the solution. Controls that are held have two rows at every jump instead.
     discon
         DISCON.IN that the file is to be flown with: every limit of it that the file breaks is told
         in `notes`, and limits that are wide enough are left as they are.
@@ -221,6 +224,8 @@ def _controls(solution: Solution, scenario: int, step: float | None) -> Trajecto
     require(1 <= scenario <= count, "scenario", scenario, f"1 to {count}")
     run = solution.trajectories[scenario - 1]
     controls = run.select(c.name for c in run.channels if c.role == "control")
+    if solution.grid.held is not None:
+        return _held(controls, solution, scenario)
     if step is None:
         return controls
     require(0 < step < np.inf, "step", step, "seconds, more than 0")
@@ -229,6 +234,18 @@ def _controls(solution: Solution, scenario: int, step: float | None) -> Trajecto
     since = np.append(step * np.arange(int(np.ceil(count - 1e-9))), run.duration)
     values = solution.at(since / run.duration, scenario - 1)[1]
     return Trajectory(run.time[0] + since, values, controls.channels, name=run.name)
+
+
+def _held(controls: Trajectory, solution: Solution, scenario: int) -> Trajectory:
+    """Two rows at every jump: what a control was before, and is after."""
+    grid, begin, duration = solution.grid, controls.time[0], controls.duration
+    assert grid.held is not None
+    middles = (grid.held[1:] + grid.held[:-1]) / 2
+    values = solution.at(middles, scenario - 1)[1]
+    ends = begin + grid.held[1:] * duration
+    starts = np.append(begin, ends[:-1] + np.minimum(_JUMP, np.diff(ends) / 2))
+    time = np.stack([starts, ends], axis=1).ravel()
+    return Trajectory(time, np.repeat(values, 2, axis=0), controls.channels, name=controls.name)
 
 
 def _chosen(run: Trajectory, kind: _Kind, name: str | None, other: str | None) -> Channel | None:

@@ -10,7 +10,14 @@ from scipy.integrate import cumulative_trapezoid
 
 from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
-from dfsm.data.between import Between, jumps, polynomials, recognised, resolved
+from dfsm.data.between import (
+    Between,
+    jumps,
+    polynomials,
+    recognised,
+    resolved,
+    rough_ones,
+)
 from dfsm.data.conversion import in_units_of
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
@@ -73,7 +80,10 @@ class Samples:
         Of the samples by the time that they stand for, 1 on average, shape ``(sample,)``; None
         where all count alike, see `weights_over_time`.
     steps
-        Intervals of every run, for those in which inputs jump.
+        Intervals of every run, for those in which inputs jump or are rough.
+    rough
+        Names of inputs that are joined by lines and turn at nearly every sample: states have a kink
+        at each, as under held ones.
     """
 
     inputs: Array
@@ -89,6 +99,7 @@ class Samples:
     terms: Terms | None = None
     weights: Array | None = None
     steps: tuple[Steps, ...] = ()
+    rough: tuple[str, ...] = ()
 
     @property
     def linear_inputs(self) -> Array:
@@ -238,12 +249,18 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
     signals = _signals(data, settings)
     steps: list[Steps] = []
-    kinked = "hold" in signals.between or any(same_instant(run.time).any() for run in data)
+    rough = _rough(data, signals, settings)
+    # Where the fit is concerned, what is rough jumps at its samples.
+    bends: list[Between] = [
+        "hold" if n in rough else kind
+        for n, kind in zip(signals.driving, signals.between, strict=True)
+    ]
+    kinked = "hold" in bends or any(same_instant(run.time).any() for run in data)
     parts: list[list[Array]] = []
     labels: tuple[tuple[str, str], ...] = ()
     for whole_run in track(data, "derivatives"):
         run = lead_in(whole_run, settings.start, settings.derivatives)
-        breaks = jumps(run, signals.driving, signals.between)
+        breaks = jumps(run, signals.driving, bends)
         extracted = differentiate(run, settings.states, settings.derivatives, breaks)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
@@ -291,7 +308,14 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         terms=terms_of(settings.terms, signals.inputs, inputs),
         weights=weights,
         steps=tuple(steps),
+        rough=rough,
     )
+
+
+def _rough(data: Dataset, signals: SignalTable, settings: FitSettings) -> tuple[str, ...]:
+    """Names of the inputs that are joined by lines and turn at nearly every sample."""
+    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
+    return rough_ones(runs, signals.driving, signals.between)
 
 
 def known_from(run: Trajectory, settings: FitSettings) -> float | None:

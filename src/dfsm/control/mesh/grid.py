@@ -7,7 +7,7 @@ end; nodes are the scheme's points in every interval.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -48,11 +48,14 @@ class Grid:
         See `scheme_of`.
     edges
         Ends of the intervals in normalised time, from 0 to 1, shape ``(interval + 1,)``.
+    held
+        Edges at which held controls change, from 0 to 1; None where controls are polynomials.
     """
 
     kind: Kind
     degree: int
     edges: Array
+    held: Array | None = None
 
     @property
     def scheme(self) -> Scheme:
@@ -107,9 +110,22 @@ class Grid:
     def control_node(self) -> IntArray:
         """Node whose control holds at every node, shape ``(node,)``."""
         nodes = np.arange(len(self.tau))
+        if self.held is not None:
+            # The last node before it changes. Edges stay what they are when intervals are cut.
+            ends = np.searchsorted(self.tau, self.held[1:])
+            return ends[np.searchsorted(ends, nodes)]
         if not self.scheme.starts:
             nodes[0] = 1
         return nodes
+
+    @cached_property
+    def own(self) -> IntArray:
+        """Nodes with equations of their own, at which constraints hold, shape ``(own node,)``."""
+        return np.arange(0 if self.scheme.starts else 1, len(self.tau))
+
+    def holding(self) -> Grid:
+        """The same mesh, with controls that are held over its intervals."""
+        return replace(self, held=self.edges)
 
     # -- between the nodes ----------------------------------------------------------------------
 
@@ -195,13 +211,13 @@ class Grid:
             np.append(left, _cuts(left, right, n, knots)) if n > 1 else [left]
             for left, right, n in zip(self.edges[:-1], self.edges[1:], pieces, strict=True)
         ]
-        return Grid(self.kind, self.degree, np.append(np.concatenate(parts), self.edges[-1]))
+        return replace(self, edges=np.append(np.concatenate(parts), self.edges[-1]))
 
     def finer(self, pieces: int) -> Grid:
         """Cut every interval into equal pieces."""
         inside = np.arange(pieces) / pieces
         edges = (self.edges[:-1, None] + self.lengths[:, None] * inside).ravel()
-        return Grid(self.kind, self.degree, np.append(edges, self.edges[-1]))
+        return replace(self, edges=np.append(edges, self.edges[-1]))
 
 
 def _cuts(left: float, right: float, pieces: int, knots: Array) -> Array:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
+from dfsm.control.levels import level
 from dfsm.control.mesh.grid import Grid
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.program import Block, Program, Rows
-from dfsm.control.problem import level
 from dfsm.core.types import Array, IntArray
 
 # Row, column and value of matrix elements.

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dfsm.control.guess import Start
+from dfsm.control.levels import level
 from dfsm.control.nlp.constraints import sizes_of
 from dfsm.control.nlp.dense import Dense, costates_at, dense_of, switching
 from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.program import Program
-from dfsm.control.problem import level
 from dfsm.core.types import Array
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def _limited(shot: Transcription, outcome: Outcome, dense: Dense) -> Iterator[_L
             label = name if count == 1 else f"{name}[{k}]"
             held = np.zeros((layout.scenarios, layout.nodes))
             at = rows[:, :, column]
-            held[:, layout.control_nodes] = outcome.multipliers[at] / program.row_scale[at]
+            held[:, shot.grid.own] = outcome.multipliers[at] / program.row_scale[at]
             size = float(sizes_of(*pair, (0,)))
             jumps = bool(layout.functions.path_jumps[column])
             yield from _beyond(label, size, dense.path[..., column], pair, jumps, held)
@@ -262,10 +262,12 @@ def _gain(
 ) -> float:
     """∫ H(x̃, ũ, λ) − min H over the intervals where limits become active; after one Newton step.
 
-    Where rates or path constraints limit controls the best control is not that of one time: 0.
+    Where rates or path constraints limit controls, or these are held, the best control is not that
+    of one time: 0.
     """
     functions, nu = shot.functions, shot.functions.nu
-    if shot.problem.rates or functions.path_jumps.any() or not nu:
+    holds = shot.grid.held is not None
+    if shot.problem.rates or functions.path_jumps.any() or holds or not nu:
         return 0.0
     at = switching(shot, outcome.z)
     if not at.size:

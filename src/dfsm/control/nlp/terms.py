@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.control.levels import is_number
 from dfsm.control.names import End, Signals
 from dfsm.control.nlp.structure import dependent, varies
-from dfsm.control.problem import OptimalControlProblem, is_number
+from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 

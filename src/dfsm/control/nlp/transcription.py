@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.control.between import disturbances_at
 from dfsm.control.guess import Start
 from dfsm.control.mesh.grid import Grid, grid_of
 from dfsm.control.mesh.schemes import Kind
@@ -118,11 +119,11 @@ class Transcription(Shot):
         scale = layout.scale(low, high)
         outputs = 1 + functions.nx + sum(functions.path_sizes.values())
         end_outputs = 1 + sum(functions.boundary_sizes.values())
-        # Constraints hold where there is a control; they come after the cost and the slopes.
-        at = np.arange(layout.scenarios)[:, None] * layout.nodes + layout.control_nodes
+        # Constraints hold where there are equations; they come after the cost and the slopes.
+        at = np.arange(layout.scenarios)[:, None] * layout.nodes + self.grid.own
         parts = [
             constraints.defects(layout, self.grid, scale, outputs),
-            constraints.path(layout, layout.control_nodes, at * outputs + 1 + functions.nx),
+            constraints.path(layout, self.grid.own, at * outputs + 1 + functions.nx),
             constraints.boundary(layout, end_outputs),
             *constraints.rates(layout, scale),
         ]
@@ -231,9 +232,9 @@ class Transcription(Shot):
         return estimate_of(self, outcome, start)
 
     def path_rows(self) -> IntArray:
-        """Constraints that are path constraints, shape ``(scenario, control node, value)``."""
+        """Constraints that are path constraints, shape ``(scenario, own node, value)``."""
         width = sum(self.functions.path_sizes.values())
-        shape = (self.layout.scenarios, len(self.layout.control_nodes), width)
+        shape = (self.layout.scenarios, len(self.grid.own), width)
         return self._first_path + np.arange(np.prod(shape)).reshape(shape)
 
     def row_nodes(self) -> IntArray:
@@ -250,12 +251,11 @@ class Transcription(Shot):
 def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Any]:
     """Time and disturbances of every node of every scenario."""
     names = problem.plant.names("disturbances")
-    count = len(problem.scenarios)
+    count, kinds = len(problem.scenarios), problem.between[len(problem.plant.names("controls")) :]
     w = np.zeros((count, len(tau), len(names)))
     for s, run in enumerate(problem.scenarios):
         if run is not None:
-            for i, name in enumerate(names):
-                w[s, :, i] = np.interp(time, run.time, run[name])
+            w[s] = disturbances_at(run, names, kinds, time, problem.last_time - problem.start)
     return {
         "tau": np.tile(tau, count),
         "scenario": np.repeat(np.arange(count), len(tau)),
