@@ -116,7 +116,11 @@ def delayed(seconds, count=800):
 
 def test_an_input_that_acts_late_is_named_and_a_delay_mends_it():
     data = delayed(7)
-    _, notes = told([data])
+    late, notes = told([data])
+    entry = late.provenance.record["verdicts"][0]
+    assert entry["nrmse"] < 0.7  # which alone would be enough for some trust
+    assert entry["verdict"] != "usable"
+    assert "'u' acts late on it (x_dot)" in entry["text"]
     assert "x_dot: 'u' acts about " in notes[0]
     assert abs(float(notes[0].split("about ")[1].split(" s")[0]) - 7) < 0.3
     late = FitSettings(

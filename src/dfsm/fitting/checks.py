@@ -11,7 +11,7 @@ from dfsm.data.dataset import Dataset
 from dfsm.errors import DfsmError, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.doubts import Doubts
-from dfsm.fitting.samples import Samples, data_warnings
+from dfsm.fitting.samples import Samples, data_warnings, held_records
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.verdicts import Evidence, verdicts
 from dfsm.models.dfsm import DFSM
@@ -31,7 +31,8 @@ def check(
     Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
     The last of what is returned are growths and verdicts, for the record.
     """
-    notes = data_warnings(data, settings, samples)
+    held = held_records(data, settings, samples)
+    notes = data_warnings(data, settings, samples) + list(held.values())
     x, u, w, p = model.split(samples.inputs)
     values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
     if not np.isfinite(values).all():
@@ -77,6 +78,7 @@ def check(
         doubts=None if doubt.outdated else doubt,
         growths=growing,
         refined=doubt.outdated,
+        records={name: f"'{name}' is held between its samples" for name in held},
     )
     judged = {
         "growth": [asdict(g) for g in growing],

@@ -1,4 +1,6 @@
-"""What speaks against the coefficients of a linear fit: feedback, dead time, noise, few samples.
+"""What speaks against the coefficients of a linear fit.
+
+Feedback, dead time, noise, few samples, and inputs too rough for their mesh.
 
 Each question has a file of its own; here they are put to every row that was fitted.
 """
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
 from dfsm.fitting.noisy_inputs import noise_shares
 from dfsm.fitting.residuals import Residuals, residuals_of
+from dfsm.fitting.rough_inputs import rough_note
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.standard_errors import standard_errors
@@ -25,6 +29,27 @@ from dfsm.numerics.time_mesh import std_over
 # A coefficient matters where its input makes so much of a row, and is not known where it is less
 # than so many standard errors.
 _MATTERS, _KNOWN = 0.2, 1.0
+_EXCITE = "runs in which a set-point or a control is excited, or linear.known"
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why not to believe a row.
+
+    Attributes
+    ----------
+    row
+        Name of the derivative.
+    kind
+        Which question it answers.
+    text, advice
+        For a verdict: what is wrong, and what to try.
+    """
+
+    row: str
+    kind: Literal["feedback", "late", "noise", "chance", "rough"]
+    text: str
+    advice: str
 
 
 @dataclass(frozen=True)
@@ -37,24 +62,21 @@ class Doubts:
         One sentence each.
     errors
         Standard errors of the coefficients, ``(row, input)``; NaN in rows that are not fitted.
-    biased
-        Names of the rows whose controls follow the states.
-    late
-        Names of the rows on which an input acts late.
+    reasons
+        The same for verdicts.
     outdated
         Whether rollouts have changed the coefficients since.
     """
 
     notes: tuple[str, ...]
     errors: Array
-    biased: tuple[str, ...] = ()
-    late: tuple[str, ...] = ()
+    reasons: tuple[Reason, ...] = ()
     outdated: bool = False
 
     @property
     def cured_by_margin(self) -> bool:
         """Whether a growth of the fit may be what `linear.margin` is there for."""
-        return self.outdated or not (self.biased or self.late)
+        return self.outdated or not any(r.kind in ("feedback", "late") for r in self.reasons)
 
 
 def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings) -> Doubts:
@@ -76,7 +98,7 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
     mean = fit.mean_coefficients
     errors = np.full(mean.shape, np.nan)
     notes: list[str] = []
-    biased, late = [], []
+    reasons: list[Reason] = []
     laws: dict[int, Law] = {}
     names, driving = samples.linear_names, len(samples.signals.driving)
     for row in (r for r in range(len(mean)) if r not in kinematic):
@@ -84,21 +106,33 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
         errors[row] = standard_errors(even, even_left[:, row], runs)
         held = {column for r, column in fit.model.known if r == row}
         errors[row, list(held)] = 0.0
-        notes += _noise(name, samples, inputs, target, mean[row])
+        for text in _noise(name, samples, inputs, target, mean[row]):
+            notes.append(text)
+            reasons.append(Reason(name, "noise", "an input is noisy", "a smoother record of it"))
         series = residuals_of(samples.time, samples.runs, inputs, target, left[:, row])
         note = None
         if series is not None:
             note = _feedback(samples, series, mean, row, held, laws)
         if note:
             notes.append(note)
-            biased.append(name)
+            reasons.append(Reason(name, "feedback", "feedback biases it", _EXCITE))
             continue
         if not fit.moved:  # for a margin it is no longer the best fit
-            notes += _unknown(name, names, mean[row], errors[row], samples, target, fit.condition)
+            told = _unknown(name, names, mean[row], errors[row], samples, target, fit.condition)
+            notes += told
+            more = Reason(name, "chance", "effects on it may be chance", "longer or more runs")
+            reasons += [more] * len(told)
+        if text := rough_note(samples, name, mean[row], target, left[:, row]):
+            notes.append(text)
+            reasons.append(
+                Reason(name, "rough", "an input is too rough for its mesh", "what is told of it")
+            )
         if series is not None and (found := late_input(series, range(driving))):
             notes.append(late_note(name, names[found.column], found, series.unexplained))
-            late.append(name)
-    return Doubts(tuple(notes), errors, tuple(biased), tuple(late))
+            reasons.append(
+                Reason(name, "late", f"'{names[found.column]}' acts late on it", "the delay told")
+            )
+    return Doubts(tuple(notes), errors, tuple(reasons))
 
 
 def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array, IntArray]:

@@ -246,15 +246,21 @@ def _fit_slopes(rows: Samples, settings: FitSettings) -> Slopes:
 def _inputs_told(samples: Samples, settings: FitSettings) -> tuple[str, ...]:
     """Which inputs were recognised as held, and what to set where they are not."""
     names = samples.signals.driving
+    rough = tuple(
+        f"{name} turns at nearly every sample: taken for lines, interval by interval (if it does "
+        f"something else in between, set inputs: {{{name}: hold}} or cubic)"
+        for name in samples.rough
+    )
     chosen = settings.inputs or {}
     if isinstance(chosen, str):
-        return ()
+        return rough
     kinds = zip(names, samples.signals.between, strict=True)
     held = [name for name, kind in kinds if kind == "hold" and name not in chosen]
     if not held:
-        return ()
+        return rough
     which = ", ".join(held)
     return (
+        *rough,
         f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
         f"samples (for lines set inputs: {{{held[0]}: linear}})",
     )

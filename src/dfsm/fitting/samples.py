@@ -196,7 +196,6 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     """What a user should know about the data before trusting a fit, one sentence each."""
     doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
     warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
-    warnings += _held_states(data, settings) + _held_inputs(data, settings, samples)
     for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
         if values.min() == values.max():
             warnings.append(
@@ -214,13 +213,18 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     return warnings
 
 
-def _held_states(data: Dataset, settings: FitSettings) -> list[str]:
+def held_records(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
+    """Channels whose samples stay where the fit takes them for motion, with a sentence each."""
+    return _held_states(data, settings) | _held_inputs(data, settings, samples)
+
+
+def _held_states(data: Dataset, settings: FitSettings) -> dict[str, str]:
     """States whose record is slower than its mesh: steps where there is motion."""
-    told = []
+    told = dict[str, str]()
     for name in dict.fromkeys(n for s in settings.states for n in s.channels):
         for run in data:
             if interval := held_interval(run.time, run[name]):
-                told.append(
+                told[name] = (
                     f"{run.where}: '{name}' changes every {interval:g} s only and stays as it was "
                     "in between, so its derivative is that of steps and its coefficients come out "
                     f"too small: set data.slower: {{{name}: linear}}, or give that record alone"
@@ -229,11 +233,11 @@ def _held_states(data: Dataset, settings: FitSettings) -> list[str]:
     return told
 
 
-def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> list[str]:
+def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
     """Inputs that are taken for lines by nobody's choice, and act as held ones."""
     chosen = settings.inputs or {}
     if isinstance(chosen, str) or samples.weights is not None:
-        return []
+        return {}
     names, states = samples.signals.driving, [s.name for s in settings.states]
     runs = [run.window(known_from(run, settings), settings.stop) for run in data]
     found = held_unseen(
@@ -242,7 +246,8 @@ def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> list
         samples.runs,
     )
     kinds = samples.signals.between
-    return [held_note(names[k]) for k in found if kinds[k] == "linear" and names[k] not in chosen]
+    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in chosen]
+    return {name: held_note(name) for name in lines}
 
 
 def extract(data: Dataset, settings: FitSettings) -> Samples:

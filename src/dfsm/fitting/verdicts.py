@@ -7,7 +7,7 @@ runs answer that: their error relative to what the channel does there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -47,12 +47,15 @@ class Evidence:
         Of the whole model.
     refined
         Whether rollouts taught the model.
+    records
+        What is wrong with records of states or inputs, by channel.
     """
 
     rollouts: Mapping[int, Simulation]
     doubts: Doubts | None
     growths: Sequence[Growth]
     refined: bool
+    records: Mapping[str, str] = field(default_factory=dict)
 
 
 def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> list[dict[str, Any]]:
@@ -70,7 +73,8 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
     Returns
     -------
     list of dict
-        ``name``, ``nrmse`` (None where a rollout ended early), ``verdict`` and ``text``.
+        ``name``, ``nrmse`` (None where a rollout ended early), ``verdict``, ``text``, and
+        ``doubt``: whether something speaks against it whatever the rollouts say.
     """
     columns = samples.signals.observed_columns
     states = samples.inputs[:, columns]
@@ -91,10 +95,17 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
         else:
             why = f"rollouts over {runs} are off by {error:.2g} of its standard deviation"
         text = f"{verdict}: {why}"
+        doubt = _doubt(name, settings, evidence)
         if verdict != "usable":
-            reason, advice = _advice(name, settings, evidence)
+            reason, advice = ("", "") if doubt is None else (f", and {doubt[0]}", doubt[1])
+            if doubt is None:
+                reason, advice = _advice(name, settings, evidence)
             text = f"{verdict}, because {why}{reason}; try {advice}"
-        entries.append({"name": name, "nrmse": error, "verdict": verdict, "text": text})
+        elif doubt is not None:
+            verdict = "for trends only"
+            text = f"{verdict}, because {doubt[0]}, although {why}; try {doubt[1]}"
+        entry = {"name": name, "nrmse": error, "verdict": verdict, "text": text}
+        entries.append(entry | {"doubt": doubt is not None})
     return entries
 
 
@@ -113,16 +124,25 @@ def _error(name: str, values: Array, samples: Samples, rollouts: Mapping[int, Si
     return float(np.mean(errors)) if errors else float("nan")
 
 
+def _doubt(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, str] | None:
+    """The first doubt about a channel, and what to try; an output follows from all states."""
+    states = [s.name for s in settings.states]
+    concerned = states if name in settings.outputs else [name]
+    inputs = {*settings.controls, *settings.driving}
+    for channel, text in evidence.records.items():
+        if channel in concerned or channel in inputs:
+            return text, "what is told of that channel"
+    rows = {f"{s}{end}": s for s in concerned for end in ("_dot", "_ddot")}
+    reasons = () if evidence.doubts is None else evidence.doubts.reasons
+    first = next((r for r in reasons if r.row in rows), None)
+    if first is None:
+        return None
+    text = f"{first.text} ({first.row})"
+    return text, first.advice
+
+
 def _advice(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, str]:
     """Why, as far as anything tells, and what to try first."""
-    d = evidence.doubts
-    if d is not None and d.biased:
-        return (
-            f", and feedback biases {', '.join(d.biased)}",
-            "runs in which a set-point or a control is excited, or linear.known",
-        )
-    if d is not None and d.late:
-        return f", and an input acts late on {', '.join(d.late)}", "the delay that is told above"
     unstable = any(g.unstable for g in evidence.growths)
     if unstable and settings.linear.margin is None:
         return ", and the model is unstable", "linear.margin, or refine"

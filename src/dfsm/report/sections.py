@@ -62,14 +62,17 @@ def verdicts(validation: Validation) -> Markup:
     v = validation
     if MULTI_FIDELITY not in v.models:
         return Markup("")
-    advised = {entry["name"]: entry["text"] for entry in v.record.get("verdicts", ())}
+    entries = {entry["name"]: entry for entry in v.record.get("verdicts", ())}
     items = []
     for channel in main_channels(v):
         error = v.mean_nrmse(MULTI_FIDELITY, channel.name)
+        entry = entries.get(channel.name, {})
+        told, doubt = entry.get("text", ""), entry.get("doubt", False)
         verdict = grade(error)
+        if doubt and verdict == "usable":
+            verdict = "for trends only"
         text = f"{channel.name}: {verdict}"
         text += "" if error is None else f" (NRMSE {_two(error)} over these runs)"
-        told = advised.get(channel.name, "")
         if verdict != "usable" and not told.startswith("usable"):
             text += f"; the fit says: {told}" if told else ""
         items.append(element("li", text))
