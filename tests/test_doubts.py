@@ -267,7 +267,8 @@ def test_a_state_that_is_held_in_its_file_is_told_and_joined_where_named():
     time = np.arange(0, 200, 0.2)
     u = np.sin(0.4 * time) + np.sin(0.15 * time)
     # x' = -0.5 x + u, its answer to each sine
-    x = sum((0.5 * np.sin(w * time) - w * np.cos(w * time)) / (0.25 + w**2) for w in (0.4, 0.15))
+    w = np.array([[0.4], [0.15]])
+    x = ((0.5 * np.sin(w * time) - w * np.cos(w * time)) / (0.25 + w**2)).sum(axis=0)
     staircase = run(time, x=x[np.arange(len(time)) // 5 * 5], u=u)
     model, notes = told([staircase])
     assert "'x' changes every 1 s only" in notes[0]

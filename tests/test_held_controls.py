@@ -16,13 +16,14 @@ from dfsm.config.template import write_config
 from dfsm.control import DirectTranscription, MultipleShooting, load_solution, save_solution, solve
 from dfsm.control.between import disturbances_at
 from dfsm.control.names import plant_of
+from dfsm.data.derivatives import StateSpec
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.exports.rosco import write_rosco
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
-from dfsm.fitting.settings import FitSettings, StateSpec
+from dfsm.fitting.settings import FitSettings
 from dfsm.simulators import ODESystem
 
 RADAU = DirectTranscription(scheme="radau", mesh=10)

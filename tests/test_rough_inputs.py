@@ -7,11 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from dfsm.data.between import rough_ones, roughness
+from dfsm.data.derivatives import StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
-from dfsm.fitting.settings import FitSettings, StateSpec
+from dfsm.fitting.settings import FitSettings
 
 SETTINGS = FitSettings(
     states=(StateSpec(name="x"),),

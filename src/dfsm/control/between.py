@@ -49,7 +49,7 @@ def kinds_of(
     names = (*controls, *disturbances)
     kinds = list(resolved(chosen, names, own))
     named = names if isinstance(chosen, str) else (chosen or {})
-    first = tuple(kinds[i] if n in named else "linear" for i, n in enumerate(controls))
+    first: list[Between] = [kinds[i] if n in named else "linear" for i, n in enumerate(controls)]
     held = [n for n, kind in zip(controls, first, strict=True) if kind == "hold"]
     if held and len(held) < len(controls):
         rest = ", ".join(n for n in controls if n not in held)
