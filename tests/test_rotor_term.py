@@ -383,6 +383,27 @@ def test_coarse_tables_are_told(plain, records):
     assert "differ from its table by up to 2 %" in doubt
 
 
+def test_factors_of_an_uncertain_table(plain):
+    uncertain = term_of(rotor(uncertainty=0.1))
+    rng = np.random.default_rng(4)
+    signals = jnp.asarray(rng.uniform([-5, 0, -20], [30, 9, 60], (40, 3)))
+    exact = jax.vmap(plain.values)(signals)
+    np.testing.assert_array_equal(jax.vmap(uncertain.values)(signals), exact)
+    assert [a.shape for a in uncertain.parameters] == [(2, 6)]
+    # A deviation of 1 is a change by the share that is uncertain.
+    constant = uncertain.moved([jnp.eye(2, 6) * jnp.array([[1.0], [0.0]])])
+    np.testing.assert_allclose(
+        jax.vmap(constant.values)(signals), exact * np.array([1.1, 1.0]), rtol=1e-12
+    )
+    # Bounded whatever the inflow.
+    moved = uncertain.moved([jnp.asarray(rng.standard_normal((2, 6)))])
+    most = 1 + np.abs(moved.trim).sum(axis=1)
+    assert np.all(np.abs(jax.vmap(moved.values)(signals)) <= np.abs(exact) * most * (1 + 1e-12))
+    assert np.abs(jax.vmap(moved.values)(signals) - exact).max() > 1.0
+    again = RotorTerm.restored(moved.columns, moved.channels, moved.arrays(), moved.structure())
+    np.testing.assert_array_equal(again.values(signals[0]), moved.values(signals[0]))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -396,6 +417,7 @@ def test_coarse_tables_are_told(plain, records):
         ({"efficiency": 1.2}, "rotor.efficiency is 1.2"),
         ({"efficiency": 0.0}, "rotor.efficiency is 0.0"),
         ({"density": 12.25}, "rotor.density is 12.25, expected kg/m³ of air (0.8 to 1.6) or water"),
+        ({"uncertainty": -0.1}, "rotor.uncertainty is -0.1, expected a share from 0 to 1"),
         ({"name": ""}, "rotor.name is empty"),
         ({"hub_height": 150.0}, "rotor.hub_height is 150.0 without rotor.pitch_rate"),
         ({"pitch_rate": "PitchRate"}, "rotor.pitch_rate is PitchRate without rotor.hub_height"),

@@ -64,6 +64,9 @@ class Rotor:
         rate, which predicts recorded runs best. ``"wind"``: they change the wind that the rotor
         feels, so that neither thrust nor torque exceed what the table has, whatever an optimizer
         does.
+    uncertainty
+        Share by which the table's thrust and torque may well be off: with one above 0 refinement
+        learns smooth factors of both, quadratic in blade pitch and inflow.
     name
         What the values are called: ``<name>.thrust`` in kN and ``<name>.torque`` in kN-m.
     """
@@ -83,6 +86,7 @@ class Rotor:
     generator_torque: str | None = None
     efficiency: float = 1.0
     memory: Literal["speed", "wind"] = "speed"
+    uncertainty: float = 0.0
     name: str = "rotor"
     kind: Literal["rotor"] = "rotor"
 
@@ -100,6 +104,8 @@ class Rotor:
         told = f"kg/m³ of air ({_AIR[0]} to {_AIR[1]}) or water ({_WATER[0]:g} to {_WATER[1]:g})"
         require(likely, "rotor.density", self.density, told)
         require(0 < self.efficiency <= 1, "rotor.efficiency", self.efficiency, "0 to 1, not 0")
+        known = bool(np.isfinite(self.uncertainty)) and 0 <= self.uncertainty <= 1
+        require(known, "rotor.uncertainty", self.uncertainty, "a share from 0 to 1")
         require(bool(self.name), "rotor.name", "empty", "a name for its values")
         if (self.hub_height is None) != (self.pitch_rate is None):
             here, lacking = ("hub_height", "pitch_rate")
@@ -181,6 +187,7 @@ class Rotor:
             inertia=self.inertia,
             efficiency=self.efficiency,
             memory=self.memory,
+            uncertainty=self.uncertainty,
             ratios=(float(table.tip_speed_ratio[0]), float(table.tip_speed_ratio[-1])),
             angles=(float(table.pitch[0]), float(table.pitch[-1])),
             optimum=table.optimum[0],
@@ -196,6 +203,7 @@ class Rotor:
             scale=jnp.asarray(self._scale(spreads or {})),
             late=jnp.zeros((1, 1)),
             grid_of_late=jnp.zeros(1),
+            trim=jnp.zeros((2, 6)),
             grid=grid,
             about=about,
         )

@@ -20,6 +20,8 @@ from dfsm.numerics.hats import hats
 
 # A tip speed below this, in m/s, counts as this: φ has no direction where nothing moves.
 _CALM = 0.01
+# Blade pitch in deg over which the factors of the table change.
+_TURN = 15.0
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class RotorConstants:
     ----------
     inputs
         Names of the signals.
-    radius, density, gearbox_ratio, inertia, efficiency, memory
+    radius, density, gearbox_ratio, inertia, efficiency, memory, uncertainty
         See `Rotor`.
     speed_factor
         The rotor's speed in rad/s per unit of the signal.
@@ -61,6 +63,7 @@ class RotorConstants:
     inertia: float | None
     efficiency: float
     memory: str
+    uncertainty: float
     ratios: tuple[float, float]
     angles: tuple[float, float]
     optimum: float
@@ -87,6 +90,8 @@ class RotorTerm(Term):
     late, grid_of_late
         What latent states add to the wind: by schedule point what a unit of each adds, and last
         what is added anyway, in m/s, shape ``(point, latent + 1)``; and the points.
+    trim
+        Coefficients of `factors`, shape ``(2, 6)``.
     grid
         Where the splines lie.
     about
@@ -99,6 +104,7 @@ class RotorTerm(Term):
     scale: jax.Array
     late: jax.Array
     grid_of_late: jax.Array
+    trim: jax.Array
     grid: Grid = eqx.field(static=True)
     about: RotorConstants = eqx.field(static=True)
 
@@ -110,8 +116,21 @@ class RotorTerm(Term):
         # No direction of the inflow is lost: only its angle is asked of the spline.
         tips = jnp.sqrt(speed**2 + _CALM**2)
         forces = surface_values(self.weights, self.grid, wind, tips, pitch)
+        forces = forces * self.factors(wind, tips, pitch)
         size = 0.5e-3 * self.about.density * np.pi * self.about.radius**2
         return forces * np.array([size, size * self.about.radius])
+
+    def factors(self, wind: jax.Array, tips: jax.Array, pitch: jax.Array) -> jax.Array:
+        """What thrust and torque of the table are multiplied by, ``(2,)``.
+
+        Quadratic in coordinates between -1 and 1, so that they are bounded at every inflow.
+        """
+        if not self.about.uncertainty:
+            return jnp.ones(2)
+        x = jnp.tanh(pitch / _TURN)
+        ahead = (self.grid.stretch * wind) ** 2
+        y = (ahead - tips**2) / (ahead + tips**2)
+        return 1 + self.trim @ jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y])
 
     def inflow(self, signals: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Wind at the rotor and speed of its tips in m/s, pitch in deg, each ``(...)``.
@@ -239,16 +258,19 @@ class RotorTerm(Term):
     def parameters(self) -> tuple[jax.Array, ...]:
         """The weights of the corrections, if there are any."""
         late = (self.late,) if self.late.shape[1] > 1 else ()
-        return (*((self.gains,) if self.gains.shape[0] else ()), *late)
+        trim = (self.trim,) if self.about.uncertainty else ()
+        return (*((self.gains,) if self.gains.shape[0] else ()), *late, *trim)
 
     def moved(self, deviations: Sequence[jax.Array]) -> RotorTerm:
         """The term with other weights of the corrections."""
-        gains, late, rest = self.gains, self.late, list(deviations)
+        gains, late, trim, rest = self.gains, self.late, self.trim, list(deviations)
         if gains.shape[0]:
             gains = gains + self.scale * rest.pop(0)
         if late.shape[1] > 1:
             late = late + rest.pop(0)
-        return replace(self, gains=gains, late=late)
+        if self.about.uncertainty:
+            trim = trim + self.about.uncertainty * rest.pop(0)
+        return replace(self, gains=gains, late=late, trim=trim)
 
     # -- model folders --------------------------------------------------------------------------
 
@@ -259,7 +281,8 @@ class RotorTerm(Term):
     def arrays(self) -> dict[str, jax.Array]:
         """Splines, weights of the corrections and their scale."""
         arrays = {"weights": self.weights, "gains": self.gains, "scale": self.scale}
-        return arrays | {"late": self.late, "grid_of_late": self.grid_of_late}
+        late = {"late": self.late, "grid_of_late": self.grid_of_late}
+        return arrays | late | {"trim": self.trim}
 
     @classmethod
     def restored(
@@ -270,7 +293,7 @@ class RotorTerm(Term):
         structure: Mapping[str, Any],
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
-        told = {"memory": "speed", **structure["about"]}
+        told = {"memory": "speed", "uncertainty": 0.0, **structure["about"]}
         # JSON turns tuples into lists, which are no keys of compiled functions.
         about: dict[str, Any] = {
             f.name: tuple(told[f.name]) if isinstance(told[f.name], list) else told[f.name]
@@ -285,6 +308,7 @@ class RotorTerm(Term):
             # Models of 0.1 and before have none.
             late=arrays.get("late", jnp.zeros((1, 1))),
             grid_of_late=arrays.get("grid_of_late", jnp.zeros(1)),
+            trim=arrays.get("trim", jnp.zeros((2, 6))),
             grid=Grid(**structure["grid"]),
             about=RotorConstants(**about),
         )
