@@ -39,15 +39,22 @@ def run() -> dict[str, Any]:
     tests = {label: rotor.with_rings(runs) for label, runs in tests.items()}
     plain = uncorrected(turbine)
     bare = {"corrective": dfsm.NoCorrection(), "outputs": ()}
-    table = replace(rotor.settings(()), **bare)
-    rings = replace(rotor.settings(), **bare)
-    through_wind = replace(rings, terms=tuple(replace(t, memory="wind") for t in rings.terms))
+    whole = replace(rotor.settings(), **bare)
+
+    def with_rotor(settings: dfsm.FitSettings, **changes: Any) -> dfsm.FitSettings:
+        terms = (replace(term, **changes) for term in settings.terms)
+        return replace(settings, **bare, terms=tuple(terms))
+
+    table = with_rotor(rotor.settings(()), memory="speed", uncertainty=0.0)
+    rings = with_rotor(whole, memory="speed", uncertainty=0.0)
+    through_wind = with_rotor(whole, uncertainty=0.0)
     results = {}
     for name, settings, refinement in (
         ("the demo's model", plain, turbine.REFINEMENT),
         ("the rotor's table instead of a schedule and a network", table, rotor.REFINEMENT),
         ("and the wind over six rings", rings, rotor.REFINEMENT),
         ("and latent states that change the wind at the rotor", through_wind, rotor.REFINEMENT),
+        ("and smooth factors of the table", whole, rotor.REFINEMENT),
     ):
         begin = time.perf_counter()
         with warnings.catch_warnings():

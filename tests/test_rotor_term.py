@@ -384,7 +384,7 @@ def test_coarse_tables_are_told(plain, records):
 
 
 def test_factors_of_an_uncertain_table(plain):
-    uncertain = term_of(rotor(uncertainty=0.1))
+    uncertain = rotor(uncertainty=0.1).term(CHANNELS, COLUMNS)
     rng = np.random.default_rng(4)
     signals = jnp.asarray(rng.uniform([-5, 0, -20], [30, 9, 60], (40, 3)))
     exact = jax.vmap(plain.values)(signals)

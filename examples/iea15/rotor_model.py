@@ -61,6 +61,8 @@ def rotor(rings: Sequence[str] = RINGS) -> dfsm.Rotor:
         corrections=tuple(f"{ring}-RotWind" for ring in rings),
         inertia=318.6e6,  # with the generator
         generator_torque="GenTq",
+        memory="wind",
+        uncertainty=0.1,
     )
 
 

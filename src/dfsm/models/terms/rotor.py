@@ -61,9 +61,9 @@ class Rotor:
         Of the gearbox: the part of the rotor's power that reaches the generator.
     memory
         How latent states reach the speed of a rotor of known inertia. ``"speed"``: they add to its
-        rate, which predicts recorded runs best. ``"wind"``: they change the wind that the rotor
-        feels, so that neither thrust nor torque exceed what the table has, whatever an optimizer
-        does.
+        rate. ``"wind"``: they change the wind that the rotor feels, so that neither thrust nor
+        torque exceed what the table has, whatever an optimizer does; with an `uncertainty` this
+        also predicts runs best.
     uncertainty
         Share by which the table's thrust and torque may well be off: with one above 0 refinement
         learns smooth factors of both, quadratic in blade pitch and inflow.
