@@ -180,12 +180,19 @@ def test_an_unused_channel_that_is_not_finite_does_no_harm(here, dfsm):
 
 def test_units_that_differ_between_files(here, dfsm):
     run = read("train/a.csv")
+    channels = [replace(c, unit="m" if c.name == "u" else c.unit) for c in run.channels]
+    write_table(replace(run, channels=tuple(channels)), "metre.csv")
+    said = complaint(dfsm, trained_on("metre.csv", "train/b.parquet"))
+    assert "channel 'u' is in " in said
+    for part in ("'m'", "'N'", "metre.csv", "b.parquet", "convert one of them"):
+        assert part in said
+    # Of one dimension they are converted, and that is told.
     channels = [replace(c, unit="kN" if c.name == "u" else c.unit) for c in run.channels]
     write_table(replace(run, channels=tuple(channels)), "kilo.csv")
-    said = complaint(dfsm, trained_on("kilo.csv", "train/b.parquet"))
-    assert "channel 'u' is in " in said
-    for part in ("'kN'", "'N'", "kilo.csv", "b.parquet", "convert one of them"):
-        assert part in said
+    write_config(Path("c.yaml"), trained_on("kilo.csv", "train/b.parquet", corrective=NONE))
+    said = dfsm("fit", "c.yaml", "-o", "m")
+    assert said.code == 0
+    assert "units converted: 'u' from kN to N" in said.err
 
 
 def test_the_same_run_twice(here, dfsm):
@@ -250,9 +257,9 @@ def test_a_run_shorter_than_the_window(here, dfsm, key, value, window):
 
 
 def test_fewer_samples_than_unknowns(here, dfsm):
-    config = changed("data", "stop", value=1.1) | {"corrective": NONE}
-    config["data"]["train"] = ["train/a.csv"]
-    said = complaint(dfsm, config)
+    config = changed("data", "stop", value=1.1)
+    data = dict(config["data"]) | {"train": ["train/a.csv"]}
+    said = complaint(dfsm, config | {"data": data, "corrective": NONE})
     assert "samples" in said
     assert "5 unknowns per target of the linear fit" in said
 

@@ -24,6 +24,7 @@ from dfsm.exports.rosco import write_rosco
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
 from dfsm.fitting.settings import FitSettings
+from dfsm.report.solution_page import outcome
 from dfsm.simulators import ODESystem
 
 RADAU = DirectTranscription(scheme="radau", mesh=10)
@@ -139,3 +140,12 @@ def test_rosco_gets_two_rows_where_a_held_control_jumps(held, tmp_path):
     at = np.array([0.0, 0.3, 0.499999, 0.5011, 0.75, 3.2, 4.999])
     flown = np.interp(at, rows[:, 0], rows[:, 1])
     np.testing.assert_allclose(np.rad2deg(flown), u[(at / 0.5).astype(int)], rtol=1e-6)
+
+
+def test_the_page_shows_the_errors_by_name(held):
+    rows = {row[0]: row[1] for row in outcome(held).rows}
+    for name in ("dynamics", "cost", "constraints", "objective"):
+        assert rows[f"error of the {name}, between the nodes"] == held.errors[name]
+    unknown = replace(held, errors={"cost": np.nan})
+    told = [row[1] for row in outcome(unknown).rows if str(row[0]).startswith("error of")]
+    assert told == [None]

@@ -32,6 +32,7 @@ from dfsm.cli.terminal import (
     ParameterFile,
     Quiet,
     SampleStep,
+    SampleStepAlone,
     Step,
     as_in_fit,
     exit_if_ended,
@@ -239,6 +240,7 @@ def validate(
     stop: Annotated[float | None, typer.Option(help="End of the test window in s.")] = None,
     method: Method = "rk4",
     step: Step = None,
+    sample_step: SampleStepAlone = None,
     interpolation: Interpolation = None,
     intervals: IntervalFile = None,
     parameters: ParameterFile = None,
@@ -264,7 +266,7 @@ def validate(
     start = fit_start(main) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     with working(quiet):
-        runs = as_in_fit(main, parametrized(read_all(files), parameters))
+        runs = as_in_fit(main, parametrized(read_all(files, step=sample_step), parameters))
         tell_notes(runs, quiet)
         for path in targets:
             check_file(path, [wall_times, intervals, parameters, *(r.source for r in runs)])

@@ -14,6 +14,7 @@ from dfsm.cli.terminal import (
     Method,
     ParameterFile,
     Quiet,
+    SampleStepAlone,
     Step,
     as_in_fit,
     exit_if_ended,
@@ -36,6 +37,7 @@ def simulate(
     stop: Annotated[float | None, typer.Option(help="End in s.")] = None,
     method: Method = "rk4",
     step: Step = None,
+    sample_step: SampleStepAlone = None,
     interpolation: Interpolation = None,
     intervals: IntervalFile = None,
     parameters: ParameterFile = None,
@@ -61,6 +63,7 @@ def simulate(
     from dfsm.validation.intervals import load_intervals
 
     settings = marching(method, step, interpolation)
+    every = step if sample_step is None else sample_step
     table_suffix(output)
     check_file(output, [path for path in (run, inputs, intervals) if path and Path(path).exists()])
     surrogate = load(model)
@@ -69,7 +72,7 @@ def simulate(
     if calibrated is not None:
         calibrated.check(surrogate)
     with working(quiet):
-        (recorded,) = as_in_fit(surrogate, parametrized([read(run, step)], parameters))
+        (recorded,) = as_in_fit(surrogate, parametrized([read(run, every)], parameters))
         tell_notes([recorded], quiet)
         if inputs is not None:
             recorded = with_inputs(recorded, read(inputs), surrogate.signals, start, stop)

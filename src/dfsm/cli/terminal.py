@@ -23,7 +23,15 @@ Files = Annotated[list[str], typer.Argument(help="Result files or patterns.", sh
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 SampleStep = Annotated[
     float | None,
-    typer.Option("--step", help="Interval between samples in s, for files without times."),
+    typer.Option(
+        "--sample-step",
+        "--step",
+        help="Interval between samples in s, for files without times; --step for short.",
+    ),
+]
+SampleStepAlone = Annotated[
+    float | None,
+    typer.Option("--sample-step", help="Interval between samples in s, for files without times."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 IntervalFile = Annotated[

@@ -6,11 +6,48 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from dfsm.core.units import agree, conversion
+from dfsm.core.units import agree, conversion, factor, known
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
 
 _NOTE = "units converted: "
+
+
+def in_one_unit(runs: Sequence[Trajectory], names: Iterable[str]) -> list[Trajectory]:
+    """Convert channels to the unit that most of some runs have, where one can.
+
+    Parameters
+    ----------
+    runs
+        In any order.
+    names
+        Channels; runs that lack one are passed over.
+
+    Returns
+    -------
+    list of Trajectory
+        Units of other dimensions stay as they are: which one is wrong nobody knows.
+
+    Warns
+    -----
+    DfsmWarning
+        What was converted, which stands in the runs' notes, too.
+    """
+    wanted = []
+    for name in dict.fromkeys(names):
+        units = [run.channel(name).unit for run in runs if name in run]
+        units = [unit for unit in units if known(unit)]
+        if not units or all(agree(units[0], unit) for unit in units):
+            continue
+        # In the order of their spelling, for the order of files must not matter.
+        usual = max(sorted(set(units)), key=lambda u: sum(agree(u, other) for other in units))
+        if all(factor(unit, usual) is not None for unit in units):
+            wanted.append(Channel(name, usual))
+    if not wanted:
+        return list(runs)
+    alike = [in_units_of(run, wanted, "the other runs") for run in runs]
+    tell_converted(runs, alike)
+    return alike
 
 
 def in_units_of(

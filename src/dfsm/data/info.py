@@ -14,6 +14,7 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrapping
 from dfsm.data.slower import slower_warning
+from dfsm.data.stuck import stuck_notes
 from dfsm.data.suspects import stray_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
@@ -227,7 +228,7 @@ def _warnings(trajectory: Trajectory) -> list[str]:
         else:
             seen[data] = name
             sentences += _looks(trajectory, name)
-    return [*sentences, *trajectory.notes]
+    return [*sentences, *stuck_notes(trajectory), *trajectory.notes]
 
 
 def _looks(run: Trajectory, name: str) -> list[str]:

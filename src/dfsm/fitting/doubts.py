@@ -19,6 +19,7 @@ from dfsm.fitting.delays import late_input, late_note
 from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
 from dfsm.fitting.noisy_inputs import noise_shares
+from dfsm.fitting.over_intervals import coarse_note
 from dfsm.fitting.residuals import Residuals, residuals_of
 from dfsm.fitting.rough_inputs import rough_note
 from dfsm.fitting.samples import Samples
@@ -47,7 +48,7 @@ class Reason:
     """
 
     row: str
-    kind: Literal["feedback", "late", "noise", "chance", "rough"]
+    kind: Literal["feedback", "late", "noise", "chance", "rough", "coarse"]
     text: str
     advice: str
 
@@ -79,7 +80,9 @@ class Doubts:
         return self.outdated or not any(r.kind in ("feedback", "late") for r in self.reasons)
 
 
-def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings) -> Doubts:
+def doubts(
+    samples: Samples, fit: LinearFit, left: Array, settings: FitSettings, intervals: bool = False
+) -> Doubts:
     """Question the linear fit of the derivatives.
 
     Parameters
@@ -92,6 +95,8 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
         What it leaves of them, ``(sample, state)``.
     settings
         Settings.
+    intervals
+        Whether the samples are means over intervals.
     """
     inputs, kinematic = samples.linear_inputs, kinematic_rows(settings.states)
     even, even_left, runs = _evenly(samples, inputs, left)
@@ -99,6 +104,14 @@ def doubts(samples: Samples, fit: LinearFit, left: Array, settings: FitSettings)
     errors = np.full(mean.shape, np.nan)
     notes: list[str] = []
     reasons: list[Reason] = []
+    if intervals:
+        A = mean[:, samples.signals.state_columns]
+        text, states = coarse_note(samples.time, samples.runs, A)
+        notes += [text] if text else []
+        for name, _ in (samples.derivative_names[i] for i in states):
+            reasons.append(
+                Reason(name, "coarse", "its samples are too far apart", "a finer record")
+            )
     laws: dict[int, Law] = {}
     names, driving = samples.linear_names, len(samples.signals.driving)
     for row in (r for r in range(len(mean)) if r not in kinematic):

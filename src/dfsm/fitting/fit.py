@@ -118,7 +118,7 @@ def fit(
         f = _fit_derivatives(rows, settings)
     with _timed(seconds, "doubts"):
         residuals = rows.derivatives - predicted(f.model, rows.linear_inputs)
-        doubt = doubts(rows, f, residuals, settings)
+        doubt = doubts(rows, f, residuals, settings, intervals=rows is not samples)
     with _timed(seconds, "corrective functions"):
         later = refinement is not None and refinement.network > 0
         e = correct(rows, rows.linear_inputs, rows.derivatives, f, settings, later)

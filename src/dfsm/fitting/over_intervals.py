@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.data.steps import Slopes, Steps
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _FITS, _SETTLED = 12, 1e-9
 # Weights that differ by less than this share are one.
 _EQUAL = 1e-3
+# Largest rate times step that the formulas follow to about 2 %, and the share of a mode that each
+# of its states has at least.
+_REACH, _SHARE = 1.8, 0.3
 
 
 def over_intervals(samples: Samples, fit: Callable[[Samples], Slopes]) -> tuple[Samples, Samples]:
@@ -65,6 +68,30 @@ def over_intervals(samples: Samples, fit: Callable[[Samples], Slopes]) -> tuple[
     inputs = samples.inputs.copy()
     inputs[:, samples.signals.state_columns] = np.concatenate([s.states for s in steps])
     return rows, replace(samples, inputs=inputs)
+
+
+def coarse_note(time: Array, runs: IntArray, A: Array) -> tuple[str, list[int]]:
+    """What to say of modes that are over within an interval, and the states that are theirs.
+
+    Parameters
+    ----------
+    time, runs
+        Of the rows over intervals.
+    A
+        Of the fit, ``(state, state)``.
+    """
+    step = float(np.median(np.diff(time)[np.diff(runs) == 0]))
+    values, vectors = np.linalg.eig(A)
+    k = int(np.argmax(np.abs(values)))
+    rate = float(np.abs(values[k]))
+    if not rate * step > _REACH:
+        return "", []
+    taking_part = np.abs(vectors[:, k] * np.linalg.pinv(vectors)[k])
+    return (
+        f"a mode of {rate:.3g} 1/s is over within the {step:.3g} s between samples, so that rates "
+        "fitted over these may be off by tens of percent: record at steps of at most "
+        f"{1 / rate:.2g} s, or give what is known of it as linear.known"
+    ), np.flatnonzero(taking_part > _SHARE).tolist()
 
 
 def _rows(

@@ -18,7 +18,7 @@ from dfsm.data.between import (
     resolved,
     rough_ones,
 )
-from dfsm.data.conversion import in_units_of
+from dfsm.data.conversion import in_one_unit, in_units_of
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import (
     differentiate,
@@ -32,6 +32,7 @@ from dfsm.data.info import gap_warning
 from dfsm.data.signs import held_interval
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
+from dfsm.data.stuck import stuck_notes
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.data.wind import wind_warning
@@ -162,7 +163,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         angle = [Channel(settings.azimuth.angle, "deg")]
         runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
-    runs = [fill_slower(r, settings.slower) for r in runs]
+    runs = in_one_unit([fill_slower(r, settings.slower) for r in runs], names)
     window = settings.start, settings.stop
     for run in runs:
         run.window(*window)
@@ -202,6 +203,10 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
                 f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
                 "model: leave it out, or add runs in which it varies"
             )
+    names = data.names
+    for run in data:
+        window = run.window(settings.start, settings.stop)
+        warnings += [f"{run.where}: {text}" for text in stuck_notes(window, names)]
     gaps = [
         f"{run.where}: {text}"
         for run in data

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from dfsm.control.solution import Solution
 from dfsm.data.trajectory import Role, Trajectory
 from dfsm.report.article import Article, Figure, Section, Table
@@ -65,7 +67,8 @@ def outcome(s: Solution) -> Table:
         ("last time (s)", float(time[-1])),
         *[(f"parameter {name}", value) for name, value in s.parameters.items()],
         (f"intervals ({s.grid.kind.replace('_', '–')})", s.grid.intervals),
-        ("largest local error", s.error),
+        *([] if s.errors else [("largest local error", s.error)]),
+        *[(f"error of the {name}, between the nodes", v) for name, v in _estimated(s)],
         ("largest violation of a constraint, relative", s.violation),
         *_optimality(s),
         ("iterations", s.iterations),
@@ -75,6 +78,11 @@ def outcome(s: Solution) -> Table:
     if s.outside is not None:
         rows.append(("outside the training range (% of the horizon)", 100 * s.outside))
     return Table("outcome", "How the solve ended", ("what", "value"), tuple(rows), digits=6)
+
+
+def _estimated(s: Solution) -> list[tuple[str, float | None]]:
+    """Errors by name, None where nothing estimates them."""
+    return [(name, v if np.isfinite(v) else None) for name, v in s.errors.items()]
 
 
 def _optimality(s: Solution) -> list[tuple[str, str | float | None]]:
