@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from dfsm.data.trajectory import Channel, Trajectory
     from dfsm.data.wind_field import with_field_wind, with_harmonics
     from dfsm.errors import DfsmError, DfsmWarning
+    from dfsm.exports.casadi_model import CasadiModel, to_casadi
     from dfsm.exports.rosco import RoscoInput, write_rosco
     from dfsm.exports.state_space import Linearization, StateSpaceModels, to_state_space
     from dfsm.fitting.corrective import NoCorrection
@@ -208,6 +209,8 @@ _HOME = {
     "TuningResult": "loops.tuning_result",
     "RunCheck": "control",
     "check_run": "control",
+    "CasadiModel": "exports.casadi_model",
+    "to_casadi": "exports.casadi_model",
     "RoscoInput": "exports.rosco",
     "write_rosco": "exports.rosco",
     "to_state_space": "exports.state_space",

@@ -39,3 +39,22 @@ def state_space(
         where = "" if made.schedule is None else f"{made.schedule.name} = {point.schedule:.4g}: "
         say(lines(f"{where}{point.message}"), quiet)
     say(lines(f"wrote {output}: {len(made)} linearizations"), quiet)
+
+
+@exports.command()
+def casadi(model: Model, output: File, quiet: Quiet = False) -> None:
+    """Functions f and g of CasADi in one file, with exact derivatives."""
+    from dfsm.core.files import check_file
+    from dfsm.exports.casadi_model import to_casadi
+    from dfsm.models.model_folder import load
+
+    check_file(output)
+    functions = to_casadi(load(model))
+    functions.save(output)
+    _tell(output, functions.description["computed_inputs"], quiet)
+
+
+def _tell(output: Path, computed: list[str], quiet: bool) -> None:
+    say(lines(f"wrote {output}"), quiet)
+    for sentence in computed:
+        say(lines(f"note: {sentence}"), quiet)

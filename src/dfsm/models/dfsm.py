@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Samples evaluated at once.
 _BLOCK = 4096
+Row = Callable[..., jax.Array]
+PointFunction = Callable[..., jax.Array]
 
 
 class DFSM(eqx.Module):
@@ -352,6 +354,32 @@ def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> j
     return outputs + model.passing(inputs, harmonics, s)
 
 
+def functions_of_points(model: DFSM) -> tuple[PointFunction, PointFunction]:
+    """f̂ and ĝ at single points as plain functions, for whoever writes them down for others.
+
+    Both take the vectors of `DFSM.derivative` and `DFSM.output`, and ĝ in addition an azimuth and
+    the wind field; nothing in them is compiled or batched.
+    """
+    model = model.prepared()
+    order = model.signals.order
+
+    def derivative(*groups: jax.Array) -> jax.Array:
+        value = order.element(model.f.schedule, *groups)
+        return _derivative(model, order.join(*groups), value)
+
+    def output(
+        x: jax.Array, u: jax.Array, w: jax.Array, p: jax.Array, *turning: jax.Array
+    ) -> jax.Array:
+        if model.g is None:
+            return jnp.zeros(0)
+        groups = (x, u, w, p)
+        harmonics = model._harmonics(*(turning or (None, None)))
+        inputs = jnp.concatenate([order.join(*groups), harmonics])
+        return _output(model, inputs, order.element(model.g.schedule, *groups))
+
+    return derivative, output
+
+
 def _with_terms(model: DFSM, inputs: jax.Array) -> jax.Array:
     """What the linear fits take: [I, φ], and blade harmonics last, of one [I, harmonics]."""
     if model.terms is None:
@@ -374,9 +402,6 @@ def _sum(
     place = {row: k for k, row in enumerate(rows)}
     extra = corrective(inputs[1])
     return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(total)])
-
-
-Row = Callable[..., jax.Array]
 
 
 @eqx.filter_jit

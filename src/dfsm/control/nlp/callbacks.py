@@ -1,6 +1,7 @@
 """A `Program` as the functions that CasADi's interface to IPOPT calls.
 
-The only file that imports CasADi; it is imported when the first problem is solved.
+With `exports.casadi_model` the only file that imports CasADi; it is imported when the first problem
+is solved.
 """
 
 from __future__ import annotations

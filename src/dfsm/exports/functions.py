@@ -1,0 +1,130 @@
+"""f̂ and ĝ of a model as programs, and what there is to say about their vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.core.version import __version__
+from dfsm.data.trajectory import Channel
+from dfsm.errors import DfsmError
+from dfsm.exports.program import Program
+from dfsm.exports.translate import UntranslatableError, translated
+from dfsm.models.dfsm import DFSM, functions_of_points
+from dfsm.models.latents import at_rest
+
+# The arguments of f and g, in this order.
+GROUPS = ("states", "controls", "disturbances", "parameters")
+# What a model with blade-passing harmonics takes in addition.
+TURNING = ("azimuth", "field")
+
+
+def programs(model: DFSM) -> dict[str, Program]:
+    """Programs of ``f`` and ``g``, and of ``g_at_azimuth`` where blades pass.
+
+    Both take states, controls, disturbances and parameters; ``g_at_azimuth`` takes in addition the
+    azimuth in rad and the harmonics of the wind field (none in a model that follows none). ``g``
+    of such a model is the average over a revolution.
+
+    Raises
+    ------
+    DfsmError
+        A term is a function with something in it that no program can have; names both.
+    """
+    inputs = [(group, len(getattr(model.signals, group))) for group in GROUPS]
+    turning = [(TURNING[0], 1), (TURNING[1], len(model.signals.field))]
+    f, g = functions_of_points(model)
+    functions: dict[str, Any] = {"f": (f, inputs), "g": (g, inputs)}
+    if model.signals.azimuth is not None:
+
+        def at_azimuth(*vectors: Any) -> Any:
+            *groups, psi, field = vectors
+            return g(*groups, psi[0], field)
+
+        functions["g_at_azimuth"] = (at_azimuth, [*inputs, *turning])
+    try:
+        return {name: translated(*function) for name, function in functions.items()}
+    except UntranslatableError as error:
+        raise DfsmError(_refusal(model, str(error))) from None
+
+
+def _refusal(model: DFSM, primitive: str) -> str:
+    """The sentence about a primitive, which names the term that it is in."""
+    for part in () if model.terms is None else model.terms.parts:
+        try:
+            translated(part.values, [("signals", len(part.columns))])
+        except UntranslatableError:
+            return (
+                f"the term '{part.channels[0].name}' cannot be exported: its function uses JAX's "
+                f"'{primitive}', which has no counterpart in other programs; write it with sums, "
+                "products, elementary functions, jnp.where and jnp.interp, or leave the term out"
+            )
+    return (
+        f"the model cannot be exported: it uses JAX's '{primitive}', which has no counterpart in "
+        "other programs; fit it with another kind of terms or corrective function"
+    )
+
+
+# -- what the vectors are -----------------------------------------------------------------------
+
+
+def description(model: DFSM) -> dict[str, Any]:
+    """Names and units of all vectors, start values, and what must be known to use the model."""
+    s, start = model.signals, starting_values(model)
+    groups = (*GROUPS, "outputs", "field")
+    told: dict[str, Any] = {"dfsm": __version__}
+    for group in groups:
+        channels: tuple[Channel, ...] = getattr(s, group)
+        told[group] = [{"name": c.name, "unit": c.unit} for c in channels]
+        for entry, value in zip(told[group], start.get(group, ()), strict=False):
+            entry["start"] = float(value)
+    kinds = s.between_samples()
+    for entry, kind in zip([*told["controls"], *told["disturbances"]], kinds, strict=False):
+        entry["between_samples"] = kind
+    told["latent_states"] = [c.name for c in s.latents]
+    told["computed_inputs"] = computed_inputs(model)
+    rate = s.azimuth_rate
+    if rate is not None:
+        told["azimuth"] = {"unit": "rad", "speed": s.states[rate[0]].name, "rad/s": rate[1]}
+    return told
+
+
+def starting_values(model: DFSM) -> Mapping[str, Array]:
+    """The middle of the training data by group; latent states are at rest there."""
+    order = model.signals.order
+    middle = at_rest(model, model.region.mean)
+    groups = order.split(middle)
+    return {g: np.asarray(v) for g, v in zip(GROUPS, groups, strict=True)}
+
+
+def computed_inputs(model: DFSM) -> list[str]:
+    """What inputs must be supplied that dfsm would compute from others, a sentence each."""
+    s, sentences = model.signals, list[str]()
+    used = set(s.order.exogenous)
+    units = {c.name: c.unit for c in (*s.controls, *s.disturbances)}
+    for feature in s.features:
+        if feature.name not in used:
+            continue
+        source = feature.source
+        if feature.kind == "rate":
+            how = f"the time derivative of {source}"
+        elif feature.kind == "lag":
+            how = f"{source} after a first-order lag of {feature.time_constant:g} s"
+        elif feature.kind == "delay":
+            how = f"{source} as it was {feature.seconds:g} s ago"
+        else:
+            how = f"{source} less {feature.less}"
+        unit = units.get(feature.name, "")
+        sentences.append(f"{feature.name}{f' ({unit})' if unit else ''} is {how}: supply it")
+    if s.hub_height is not None:
+        from dfsm.data.wind import CORRECTED_WIND
+
+        if CORRECTED_WIND in used:
+            sentences.append(
+                f"{CORRECTED_WIND} is the rotor-averaged wind without what the platform's motion "
+                f"adds at a hub {s.hub_height:g} m above it: supply it"
+            )
+    return sentences
