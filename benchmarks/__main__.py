@@ -1,7 +1,7 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-    [unseen] [limits] [matched] [control] [codesign] [peer] [fuzz] [kill]
+    [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [fuzz] [kill]
 
 Without names all but `peer`, which makes an environment of its own and installs jax-sysid there,
 and `fuzz` and `kill`, which damage inputs and end commands for hours (``fuzz --inputs 20000``).
@@ -22,6 +22,7 @@ from benchmarks import (
     codesign,
     control,
     derivatives,
+    exports,
     field,
     fuzz,
     kill,
@@ -49,6 +50,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "matched": matched.run,
     "control": control.run,
     "codesign": codesign.run,
+    "exports": exports.run,
     "peer": peer.run,
     "fuzz": fuzz.run,
     "kill": kill.run,

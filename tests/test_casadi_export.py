@@ -42,7 +42,7 @@ def test_a_model_of_all_parts_is_the_same_inside_and_outside_the_data(functions)
     close(np.array(ours).T, np.asarray(model.output(*groups)))
     psi, field = turning(model)
     ours = functions.g_at_azimuth.map(len(psi))(*columns, psi[None], field.T)
-    close(np.array(ours).T, np.asarray(model.output(*groups, psi, field)))
+    close(np.array(ours).T, np.asarray(model.output(*groups, azimuth=psi, field=field)))
 
 
 def test_first_and_second_derivatives(functions):

@@ -45,7 +45,10 @@ if TYPE_CHECKING:
     from dfsm.data.trajectory import Channel, Trajectory
     from dfsm.data.wind_field import with_field_wind, with_harmonics
     from dfsm.errors import DfsmError, DfsmWarning
+    from dfsm.exports.c_code import write_c
     from dfsm.exports.casadi_model import CasadiModel, to_casadi
+    from dfsm.exports.fmu import write_fmu
+    from dfsm.exports.python_model import write_python
     from dfsm.exports.rosco import RoscoInput, write_rosco
     from dfsm.exports.state_space import Linearization, StateSpaceModels, to_state_space
     from dfsm.fitting.corrective import NoCorrection
@@ -211,6 +214,9 @@ _HOME = {
     "check_run": "control",
     "CasadiModel": "exports.casadi_model",
     "to_casadi": "exports.casadi_model",
+    "write_c": "exports.c_code",
+    "write_fmu": "exports.fmu",
+    "write_python": "exports.python_model",
     "RoscoInput": "exports.rosco",
     "write_rosco": "exports.rosco",
     "to_state_space": "exports.state_space",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,8 @@ exports = typer.Typer(
 )
 Model = Annotated[Path, typer.Argument(help="Model folder.")]
 File = Annotated[Path, typer.Option("--output", "-o", help="File to write.")]
+Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
+Name = Annotated[str | None, typer.Option(help="Prefix of all names; default the folder's.")]
 
 
 @exports.command("state-space")
@@ -54,7 +57,52 @@ def casadi(model: Model, output: File, quiet: Quiet = False) -> None:
     _tell(output, functions.description["computed_inputs"], quiet)
 
 
-def _tell(output: Path, computed: list[str], quiet: bool) -> None:
+def _tell(output: Path | str, computed: Sequence[str], quiet: bool) -> None:
     say(lines(f"wrote {output}"), quiet)
     for sentence in computed:
         say(lines(f"note: {sentence}"), quiet)
+
+
+@exports.command()
+def c(model: Model, output: Folder, name: Name = None, quiet: Quiet = False) -> None:
+    """One C99 file and its header: f, g, a Runge-Kutta step, names and units."""
+    from dfsm.exports.c_code import write_c
+    from dfsm.models.model_folder import load
+
+    made = write_c(load(model), output, name)
+    _tell(output, made.description["computed_inputs"], quiet)
+
+
+@exports.command()
+def python(model: Model, output: Folder, quiet: Quiet = False) -> None:
+    """A file of Python that needs NumPy alone, and the model's numbers beside it."""
+    from dfsm.exports.python_model import write_python
+    from dfsm.models.model_folder import load
+
+    _tell(output, write_python(load(model), output)["computed_inputs"], quiet)
+
+
+@exports.command()
+def fmu(
+    model: Model,
+    output: File,
+    fmi: Annotated[int, typer.Option(help="Version of the standard: 2 or 3.")] = 3,
+    kind: Annotated[
+        str | None, typer.Option(help="model-exchange or co-simulation; default both.")
+    ] = None,
+    step: Annotated[
+        float | None, typer.Option(help="Longest Runge-Kutta step of a co-simulation in s.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """An FMU with sources, and a binary where a C compiler is present."""
+    from dfsm.exports.fmu import write_fmu
+    from dfsm.models.model_folder import load
+
+    made = write_fmu(load(model), output, fmi=fmi, kind=kind, step=step)  # pyright: ignore[reportArgumentType]
+    what = (
+        "sources alone: no C compiler here"
+        if made.binary is None
+        else f"a binary for {made.binary}"
+    )
+    _tell(f"{output} ({what})", made.computed_inputs, quiet)

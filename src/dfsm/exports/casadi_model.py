@@ -112,7 +112,32 @@ def to_casadi(model: DFSM) -> CasadiModel:
     )
 
 
-def to_function(program: Program, name: str) -> Any:
+def c_functions(model: DFSM, name: str) -> tuple[str, dict[str, tuple[int, int, int, int]]]:
+    """C code of a model's functions as CasADi writes it.
+
+    Parameters
+    ----------
+    model
+        The model.
+    name
+        Prefix of all names in the code.
+
+    Returns
+    -------
+    tuple
+        The code, which defines a static function ``<name>_f`` and so on for every program; and how
+        many arguments, results, integers and numbers each needs room for.
+    """
+    options = {"with_header": False, "verbose": False}
+    generator, sizes = casadi.CodeGenerator(f"{name}.c", options), {}
+    for short, program in programs(model).items():
+        function = to_function(program, short, prefix=f"{name}_")
+        generator.add(function)
+        sizes[short] = (function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w())
+    return f"#define CASADI_SYMBOL_EXPORT static\n{generator.dump()}", sizes
+
+
+def to_function(program: Program, name: str, prefix: str = "") -> Any:
     """A `casadi.Function` of a program."""
     arguments = [casadi.MX.sym(n, size) for n, size in program.inputs]
     # Zeros among constants are left out, so that derivatives know of them.
@@ -122,7 +147,9 @@ def to_function(program: Program, name: str) -> Any:
         values.append(_result(step, [values[k] for k in step.of]))
     names = [n for n, _ in program.inputs]
     what = "derivatives" if name == "f" else "outputs"
-    return casadi.Function(name, arguments, [casadi.densify(values[program.result])], names, [what])
+    return casadi.Function(
+        prefix + name, arguments, [casadi.densify(values[program.result])], names, [what]
+    )
 
 
 def _result(step: Step, of: list[Any]) -> Any:
