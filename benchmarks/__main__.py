@@ -1,10 +1,11 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-    [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [fuzz] [kill]
+    [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [dymos] [fuzz] [kill]
 
-Without names all but `peer`, which makes an environment of its own and installs jax-sysid there,
-and `fuzz` and `kill`, which damage inputs and end commands for hours (``fuzz --inputs 20000``).
+Without names all but `peer` and `dymos`, which make environments of their own and install
+jax-sysid and dymos there, and `fuzz` and `kill`, which damage inputs and end commands for hours
+(``fuzz --inputs 20000``).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from benchmarks import (
     codesign,
     control,
     derivatives,
+    dymos_peer,
     exports,
     field,
     fuzz,
@@ -52,11 +54,12 @@ PARTS: dict[str, Callable[..., object]] = {
     "codesign": codesign.run,
     "exports": exports.run,
     "peer": peer.run,
+    "dymos": dymos_peer.run,
     "fuzz": fuzz.run,
     "kill": kill.run,
 }
 # Run where they are named alone.
-NAMED = ("peer", "fuzz", "kill")
+NAMED = ("peer", "dymos", "fuzz", "kill")
 
 
 def main() -> None:

@@ -140,6 +140,17 @@ def page(validation, broken, tmp_path_factory):
     return Page(path)
 
 
+def unpacked(blob):
+    """An array as the page's script reads it."""
+    kind, offset, step, text = blob
+    data = base64.b64decode(text)
+    if kind == "f4":
+        return offset + np.frombuffer(data, "<f4").astype(float)
+    steps = np.frombuffer(data, "<u2").astype(float)
+    exact = offset + step * np.where(steps == 65535, np.nan, steps)
+    return 10**exact if kind == "log" else exact
+
+
 def value(text):
     return float(text.replace("\N{NARROW NO-BREAK SPACE}", "").replace("\N{MINUS SIGN}", "-"))
 
@@ -211,7 +222,7 @@ def test_derivatives_and_eigenvalues_are_what_the_validation_says(page, validati
 def test_series_are_those_of_the_validation(page, validation):
     data = page.data
     run = data["models"][0]["runs"][0]
-    drawn = np.frombuffer(base64.b64decode(data["blobs"][run["recorded"]["y"][0]]), "<f4")
+    drawn = unpacked(data["blobs"][run["recorded"]["y"][0]])
     time = run["recorded"]["t0"] + run["recorded"]["dt"] * np.arange(len(drawn))
     recorded = validation.runs[0].recorded
     assert run["recorded"]["dt"] == pytest.approx(0.2)
@@ -284,11 +295,14 @@ def test_prediction_intervals_are_drawn_and_told(validation, broken, page, tmp_p
     drawn = run["variants"]["multi-fidelity"]
 
     def curve(series, channel):
-        blob = shaded.data["blobs"][series["y"][channel]]
-        return np.frombuffer(base64.b64decode(blob), "<f4")
+        # Lines through the samples that are kept are as good as all of them.
+        y = unpacked(shaded.data["blobs"][series["y"][channel]])
+        kept = series["every"][channel] * np.arange(len(y))
+        return np.interp(np.arange(kept[-1] + 1), kept, y)
 
     for channel, width in enumerate(half[0]):
-        low, high = (curve(end, channel) for end in drawn["band"])
+        beside = curve(drawn["band"], channel)
+        low, high = (curve(drawn, channel) + side * beside for side in (-1, 1))
         np.testing.assert_allclose(high - low, 2 * width, atol=1e-5)
         np.testing.assert_allclose((high + low) / 2, curve(drawn, channel), atol=1e-5)
     calm, runaway = shaded.rows("Channel", "Unit", "smallest")

@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     from dfsm.models.terms import Function, Product, QuadraticDrag, Rotor
     from dfsm.refinement.refine import RefineResult, refine
     from dfsm.refinement.settings import RefineSettings
-    from dfsm.report import write_report, write_solution_report
+    from dfsm.report import write_model_card, write_report, write_solution_report
     from dfsm.selection.compare import RankedCandidate, Ranking, compare
     from dfsm.selection.trial import Candidate, Outcome
     from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
@@ -223,6 +223,7 @@ _HOME = {
     "StateSpaceModels": "exports.state_space",
     "Linearization": "exports.state_space",
     "write_report": "report",
+    "write_model_card": "report",
     "write_solution_report": "report",
     "load_config": "config.fit",
 }

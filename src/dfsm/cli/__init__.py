@@ -22,6 +22,7 @@ from dfsm.cli.control import check_run, export_rosco
 from dfsm.cli.export import exports
 from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
+from dfsm.cli.report import report
 from dfsm.cli.simulate import simulate
 from dfsm.cli.terminal import (
     AsJson,
@@ -67,6 +68,7 @@ app.command()(optimize)
 app.command("export-rosco")(export_rosco)
 app.command("check-run")(check_run)
 app.command()(calibrate)
+app.command()(report)
 app.command()(wind)
 app.command("closed-loop")(closed_loop)
 app.command()(tune)

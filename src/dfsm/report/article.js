@@ -11,7 +11,7 @@
 
   const safe = (text) =>
     String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
-  const array = (index) => ({ dtype: "f4", bdata: data.blobs[index] });
+  const array = (index) => unpack(data.blobs, index);
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const colour = (index) => css(index === 0 ? "--recorded" : `--curve-${((index - 1) % 5) + 1}`);
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table, legend
+from dfsm.report.blobs import Blobs
 from dfsm.report.document import document, write_document
 from dfsm.report.elements import Cell, Markup, element, join, table
-from dfsm.report.figures import Blobs
 
 # Longer texts in tables are broken into lines.
 _LONG = 40

@@ -5,8 +5,8 @@ Nothing here is a figure of merit: those are computed from all samples and stand
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from scipy.signal import resample_poly
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.numerics.spectra import Band, Spectrum
+from dfsm.report.blobs import Blobs
+from dfsm.report.first_screen import scores
 from dfsm.simulation.simulate import Simulation, Status
 from dfsm.validation.results import ChannelStatistics, ModelRun, RunComparison, Validation
 from dfsm.validation.validate import LOW, frequency_bands
@@ -26,23 +28,8 @@ _MOST_POINTS = 6000
 # What a rollout that ended at once leaves is drawn sample by sample.
 _FEW_POINTS = 200
 _HIGHEST = 1.0
-
-
-class Blobs:
-    """Arrays as base64 of little-endian 32-bit floats, each distinct one stored once."""
-
-    def __init__(self) -> None:
-        self.encoded: list[str] = []
-        self._known: dict[bytes, int] = {}
-
-    def add(self, values: Array) -> int:
-        """Store an array and return its index."""
-        limit = np.finfo(np.float32).max
-        data = np.clip(values, -limit, limit).astype("<f4").tobytes()
-        if data not in self._known:
-            self._known[data] = len(self.encoded)
-            self.encoded.append(base64.b64encode(data).decode("ascii"))
-        return self._known[data]
+# Share of its range by which a drawn line may be off: a third of a pixel of 120.
+_UNSEEN = 1 / 360
 
 
 def page_data(validations: Mapping[str, Validation]) -> dict[str, Any]:
@@ -109,6 +96,7 @@ def _model(name: str, validation: Validation, blobs: Blobs) -> dict[str, Any]:
             for s, v in validation.eigenvalues
         ],
         "schedule": first.schedule,
+        "scores": scores(validation),
     }
 
 
@@ -137,7 +125,33 @@ def _run(validation: Validation, run: RunComparison, blobs: Blobs) -> dict[str, 
 
 def _series(run: Trajectory, names: Sequence[str], blobs: Blobs) -> dict[str, Any]:
     start, step, values = thin(run.select(names))
-    return {"t0": start, "dt": step, "y": [blobs.add(v) for v in values.T]}
+    every = [coarsest(v) for v in values.T]
+    y = [blobs.add_drawn(v[::n]) for v, n in zip(values.T, every, strict=True)]
+    return {"t0": start, "dt": step, "every": every, "y": y}
+
+
+def coarsest(values: Array) -> int:
+    """How many samples a drawn line can step over without being seen to differ.
+
+    Parameters
+    ----------
+    values
+        Equidistant samples, shape ``(time,)``.
+
+    Returns
+    -------
+    int
+        A power of two that ends at the last sample. Lines through every so many samples are
+        off by less than a third of a pixel where a panel is as high as the range of the values.
+    """
+    allowed = _UNSEEN * float(np.ptp(values)) if np.isfinite(values).all() else -1.0
+    factor, places = 1, np.arange(len(values))
+    while (len(values) - 1) % (2 * factor) == 0 and 2 * factor < len(values):
+        kept = places[:: 2 * factor]
+        if np.abs(np.interp(places, kept, values[kept]) - values).max() > allowed:
+            break
+        factor *= 2
+    return factor
 
 
 def _spectra(
@@ -149,7 +163,7 @@ def _spectra(
     spectra = [_shown(statistics[name].spectrum) for name in names]
     frequency = spectra[0].frequency
     return {
-        "psd": [blobs.add(s.density) for s in spectra],
+        "psd": [blobs.add_logarithmic(s.density) for s in spectra],
         "df": float(frequency[1] - frequency[0]) if len(frequency) > 1 else 1.0,
     }
 
@@ -164,8 +178,12 @@ def _shown(spectrum: Spectrum) -> Spectrum:
 
 
 def _band(model: ModelRun, names: Sequence[str], blobs: Blobs) -> dict[str, Any]:
-    """Ends of the prediction intervals, lower first; without them nothing."""
-    return {"band": [_series(end, names, blobs) for end in model.band]} if model.band else {}
+    """Half the height of the prediction intervals around the rollout; without them nothing."""
+    if model.band is None:
+        return {}
+    low, high = model.band
+    half = replace(low, values=(high.values - low.values) / 2)
+    return {"band": _series(half, names, blobs)}
 
 
 def _completed(model: ModelRun) -> bool:

@@ -14,8 +14,8 @@ from dfsm.models.dfsm import DFSM
 from dfsm.report.article import Table
 from dfsm.report.closed_loop_article import over_runs
 from dfsm.report.elements import Markup, element, join, plural
+from dfsm.report.first_screen import main_channels
 from dfsm.report.model_tables import signal_table, verdict_table
-from dfsm.report.sections import main_channels
 from dfsm.report.solution_page import outcome
 from dfsm.selection.compare import Ranking
 from dfsm.simulation.closed_loop import ClosedLoopRun

@@ -9,7 +9,7 @@
   const hiddenVariants = new Set();
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
 
-  const array = (index) => ({ dtype: "f4", bdata: data.blobs[index] });
+  const array = (index) => unpack(data.blobs, index);
   const labelled = (name, unit) => "<b>" + safe(name) + "</b>" + (unit ? "  " + safe(unit) : "");
   const squared = (unit) => (unit ? (/^[\w%]+$/.test(unit) ? unit : `(${unit})`) + "²/Hz" : "1/Hz");
   const short = (value) => Number(value.toPrecision(5)).toString();
@@ -38,6 +38,87 @@
   // Curves' colours have six hexadecimal digits; two more give the opacity.
   const tint = (colour) => colour + "30";
 
+  // The verdict: one row per signal, one mark per variant, where it falls among the grades.
+  const FAR = 1.2;
+  const brief = (name) => {
+    const most = narrow.matches ? 14 : 24;
+    return safe(name.length > most ? name.slice(0, most - 1) + "…" : name);
+  };
+
+  function drawVerdict() {
+    const { channels, nrmse, completed, limits } = model().scores;
+    const traces = shown().map(([name, i]) => {
+      const values = nrmse[name].map((v) => (v === null && !completed[name] ? FAR : v));
+      const told = nrmse[name].map((v) => (v === null ? "ended early" : v.toPrecision(2)));
+      return {
+        type: "scatter",
+        mode: "markers",
+        name: safe(name),
+        x: values.map((v) => (v === null ? null : Math.min(v, FAR))),
+        y: channels.map((_, k) => k),
+        customdata: told,
+        marker: {
+          color: curve(i),
+          size: 10,
+          symbol: values.map((v) => (v >= FAR ? "triangle-right" : "circle")),
+          line: { color: css("--paper"), width: 1 },
+        },
+        hovertemplate: "%{customdata}",
+      };
+    });
+    const layout = base(92 + 30 * channels.length, 44, 40);
+    const ends = [0, ...limits, FAR * 1.04];
+    const words = ["usable", narrow.matches ? "trends" : "for trends only", "not usable"];
+    words.forEach((word, k) => {
+      layout.shapes.push({
+        type: "rect",
+        layer: "below",
+        xref: "x",
+        yref: "paper",
+        x0: ends[k],
+        x1: ends[k + 1],
+        y0: 0,
+        y1: 1,
+        fillcolor: css(`--grade-${k + 1}`),
+        line: { width: 0 },
+      });
+      layout.annotations.push({
+        text: word,
+        x: (ends[k] + ends[k + 1]) / 2,
+        y: 1,
+        xref: "x",
+        yref: "paper",
+        yanchor: "bottom",
+        showarrow: false,
+        font: { size: 11, color: css("--soft") },
+      });
+    });
+    layout.xaxis = axis({
+      title: {
+        text: narrow.matches ? "mean NRMSE" : "error / spread of the record (mean NRMSE)",
+        standoff: 4,
+        font: { size: 12 },
+      },
+      range: [0, FAR * 1.04],
+    });
+    layout.yaxis = axis({
+      tickvals: channels.map((_, k) => k),
+      ticktext: channels.map(brief),
+      range: [channels.length - 0.5, -0.5],
+      automargin: true,
+      zeroline: false,
+    });
+    layout.hovermode = "closest";
+    const entries = shown().map(([name, i]) => {
+      const [entry, mark] = [node("span", "", "band"), node("span", "", "dot")];
+      mark.style.background = curve(i);
+      entry.append(mark, name);
+      return entry;
+    });
+    byId("verdict-key").replaceChildren(...entries.flatMap((e) => [e, " "]));
+    draw("verdict-plot", traces, layout);
+  }
+
   function drawSeries() {
     const r = run();
     const banded = model().variants.findIndex((name) => r.variants[name].band);
@@ -50,11 +131,11 @@
         ...line(name, colour, width),
         y: array(s.y[c]),
         x0: s.t0,
-        dx: s.dt,
+        dx: s.dt * s.every[c],
         hovertemplate: "%{y:.5~g}",
       });
       const traces = [];
-      for (const [name, i] of shown()) traces.push(...shade(r.variants[name].band, c, curve(i)));
+      for (const [name, i] of shown()) traces.push(...shade(r.variants[name], c, curve(i)));
       traces.push(at(r.recorded, "recorded", css("--recorded"), 1.6));
       for (const [name, i] of shown()) {
         const s = r.variants[name];
@@ -76,16 +157,20 @@
     byId("endings").replaceChildren(...notes);
   }
 
-  // Between the ends of prediction intervals; drawn first, so it lies below all curves.
-  function shade(band, c, colour) {
-    return (band || []).map((end, k) => ({
+  // Prediction intervals around a rollout; drawn first, so they lie below all curves.
+  function shade(s, c, colour) {
+    if (!s.band) return [];
+    const [y, half] = [array(s.y[c]), array(s.band.y[c])];
+    const [step, wide] = [s.dt * s.every[c], s.band.dt * s.band.every[c]];
+    const at = (k) => half[Math.min(Math.round((k * step) / wide), half.length - 1)];
+    return [-1, 1].map((side, n) => ({
       type: "scatter",
       mode: "lines",
-      y: array(end.y[c]),
-      x0: end.t0,
-      dx: end.dt,
+      y: y.map((v, k) => v + side * at(k)),
+      x0: s.t0,
+      dx: step,
       line: { width: 0 },
-      fill: k ? "tonexty" : "none",
+      fill: n ? "tonexty" : "none",
       fillcolor: tint(colour),
       hoverinfo: "skip",
     }));
@@ -275,6 +360,7 @@
   }
 
   function redraw() {
+    drawVerdict();
     drawSeries();
     drawSpectra();
     drawErrors();

@@ -17,7 +17,7 @@ from dfsm.loops.load_cases import Figures
 from dfsm.loops.sweep import Sweep
 from dfsm.report.article import Curve, Figure, Panel
 from dfsm.report.figures import within_reason
-from dfsm.report.sections import main_channels
+from dfsm.report.first_screen import main_channels
 from dfsm.report.solution_page import course
 from dfsm.selection.compare import Ranking
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus

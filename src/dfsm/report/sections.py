@@ -1,4 +1,4 @@
-"""Headlines, accuracy and model sections of the page; the run by run tables are in runs.py."""
+"""Summary, accuracy and model sections of the page; the run by run tables are in runs.py."""
 
 from __future__ import annotations
 
@@ -7,147 +7,46 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.data.trajectory import Channel
-from dfsm.fitting.verdicts import grade
 from dfsm.models.stability import Growth
 from dfsm.report.elements import MISSING, Cell, Markup, element, join, number, plural, table
-from dfsm.simulation.simulate import Status
-from dfsm.validation.results import MULTI_FIDELITY, Validation
+from dfsm.report.first_screen import endings, grades, judged, main_channels
+from dfsm.validation.results import Validation
 
-# More sentences than this about rollouts that ended early are folded away.
-_MOST_NOTES = 5
-# Share of the time outside the training range above which a reader is told.
-_OUTSIDE = 0.05
+# -- summary --------------------------------------------------------------------------------------
 
 
-def main_channels(validation: Validation) -> list[Channel]:
-    """Measured states and outputs: what a reader asks for first, rates left out."""
-    first = next(iter(validation.models.values()))
-    measured = [spec.name for spec in first.signals.specs]
-    return [c for c in validation.channels if c.role != "state" or c.name in measured]
-
-
-# -- headline -----------------------------------------------------------------------------------
-
-
-def headline(name: str, validation: Validation) -> Markup:
-    """One paragraph per fitted model in plain words, and what to know before trusting it."""
+def completions(name: str, validation: Validation) -> Markup:
+    """How many rollouts came to their end, and whether anything was corrected at all."""
     v, count = validation, len(validation.runs)
     durations = [r.recorded.duration for r in v.runs]
     completed = [(m, v.completed(m)) for m in v.models]
     span = f"{np.mean(durations):.0f} s" if np.ptp(durations) < 1 else "different lengths"
     tested = f"{plural(count, 'test run')} of {span}"
     if all(n == count for _, n in completed):
-        text = f"Every variant completed {'its' if count == 1 else 'all'} {tested}. "
+        text = f"{name}: every variant completed {'its' if count == 1 else 'all'} {tested}."
     else:
         each = ", ".join(f"{m} {n} of {count}" for m, n in completed)
-        text = f"Completed, of {tested}: {each}. "
-    scores = [
-        f"{m} ({', '.join(f'{c.name} {_two(v.mean_nrmse(m, c.name))}' for c in main_channels(v))})"
-        for m, n in completed
-        if n == count
-    ]
-    if scores:
-        text += f"Mean NRMSE: {_listed(scores)}. "
+        text = f"{name}: completed, of {tested}: {each}."
     rows = v.record.get("rows", ())
     if rows and not any(r.get("corrected") for r in rows):
-        text += "No row was corrected, so the multi-fidelity model is its linear fit. "
-    text += _speed(v)
-    parts = (element("h3", name), element("p", text), verdicts(v), cautions(v))
-    return element("article", *parts, cls="headline")
+        text += " No row was corrected, so the multi-fidelity model is its linear fit."
+    return element("p", text)
 
 
-def verdicts(validation: Validation) -> Markup:
-    """What each measured signal is good for by these runs, and what its fit advises if not."""
-    v = validation
-    if MULTI_FIDELITY not in v.models:
-        return Markup("")
-    entries = {entry["name"]: entry for entry in v.record.get("verdicts", ())}
-    items = []
-    for channel in main_channels(v):
-        error = v.mean_nrmse(MULTI_FIDELITY, channel.name)
-        entry = entries.get(channel.name, {})
-        told, doubt = entry.get("text", ""), entry.get("doubt", False)
-        verdict = grade(error)
-        if doubt and verdict == "usable":
-            verdict = "for trends only"
-        text = f"{channel.name}: {verdict}"
-        text += "" if error is None else f" (NRMSE {_two(error)} over these runs)"
-        if verdict != "usable" and not told.startswith("usable"):
-            text += f"; the fit says: {told}" if told else ""
-        items.append(element("li", text))
-    return element("ul", *items)
-
-
-def _two(value: float | None) -> str:
-    return number(value, 2)
-
-
-def _listed(items: Sequence[str]) -> str:
-    """Join as "a, b and c"."""
-    return " and ".join(part for part in (", ".join(items[:-1]), items[-1]) if part)
-
-
-def _speed(v: Validation) -> str:
-    length = np.mean([r.recorded.duration for r in v.runs])
-    unfinished = any(v.completed(m) < len(v.runs) for m in v.models)
-    text = (
-        f"A rollout of {length:.0f} s{' (unfinished ones included)' if unfinished else ''} takes "
-    )
-    text += _listed([f"{_two(v.wall_time(m))} s ({m})" for m in v.models])
-    known = [r for m in v.models if (r := v.speed_up(m)) is not None]
-    if not known:
-        return text + "."
-    recorded = np.mean([t for r in v.runs if (t := r.recorded.wall_time) is not None])
-    return (
-        f"{text}, the simulator {number(float(recorded))} s: "
-        f"{_listed([_two(r) for r in known])} times as long."
-    )
-
-
-def cautions(validation: Validation) -> Markup:
-    """Warnings, rollouts that ended early, and time outside the training range."""
-    notes: list[object] = [*validation.warnings, *validation.record.get("warnings", ())]
-    notes += [_outside(validation, m) for m in validation.models]
-    notes += endings(validation)
-    notes = [element("li", n) for n in notes if n]
-    if not notes:
-        return Markup("")
-    shown, folded = notes[:_MOST_NOTES], notes[_MOST_NOTES:]
-    more = element("details", element("summary", f"{len(folded)} more"), element("ul", *folded))
-    return element(
-        "div",
-        element("p", "Before trusting these figures", cls="label"),
-        element("ul", *shown),
-        more if folded else "",
-        cls="caution",
-    )
-
-
-def endings(validation: Validation, model: str | None = None) -> list[str]:
-    """One sentence per rollout that ended early: which, when, and which state went where."""
-    return [
-        f"{name} on {r.recorded.name} ended at {m.simulation.ended:.4g} s of "
-        f"{r.recorded.time[-1]:.4g} s: {m.simulation.reason}"
-        for r in validation.runs
-        for name, m in r.models.items()
-        if m.simulation.status is not Status.COMPLETED and model in (None, name)
+def verdicts(name: str, validation: Validation) -> Markup:
+    """What each signal is good for by these runs, and by its fit, which knows what to try."""
+    found = grades(validation)
+    model = judged(validation)
+    advised = {entry["name"]: entry["text"] for entry in validation.record.get("verdicts", ())}
+    rows = [
+        [n, verdict, validation.mean_nrmse(model, n), Cell(advised.get(n, MISSING), "long")]
+        for n, verdict in found.items()
     ]
-
-
-def _outside(validation: Validation, model: str) -> str:
-    shares = [
-        s.outside
-        for r in validation.runs
-        if (s := r.models[model].simulation).status is Status.COMPLETED
-    ]
-    if not shares or max(shares) <= _OUTSIDE:
-        return ""
-    low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
-    share = high if low == high else f"{low} to {high}"
-    return (
-        f"{model} spent {share} % of the time of its completed rollouts with an input or state "
-        "outside the training range"
+    return table(
+        f"{name}: what each signal is good for, by {model} over these runs and by its fit",
+        [],
+        ["Signal", "By these runs", "NRMSE", "By the fit"],
+        rows,
     )
 
 

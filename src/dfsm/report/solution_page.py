@@ -49,6 +49,7 @@ def solution_article(solution: Solution) -> Article:
         title=solution.name,
         lede=solution.message[:1].upper() + solution.message[1:] + ".",
         sections=(
+            *[_course(solution, k, count) for k in range(count)],
             Section("outcome", "Outcome", tables=(outcome(solution),)),
             *[_scenario(solution, k, count) for k in range(count)],
         ),
@@ -118,8 +119,13 @@ def _scenario(s: Solution, k: int, count: int) -> Section:
         ),
         digits=5,
     )
-    heading = f"Scenario {k + 1}: {run.name}" if count > 1 else "Signals"
-    return Section(f"scenario-{k + 1}", heading, tables=(table,), figures=(course(s, k),))
+    heading = f"Signals of scenario {k + 1}" if count > 1 else "Signals"
+    return Section(f"signals-{k + 1}", heading, tables=(table,))
+
+
+def _course(s: Solution, k: int, count: int) -> Section:
+    heading = f"Scenario {k + 1}: {s.trajectories[k].name}" if count > 1 else "The optimum"
+    return Section(f"scenario-{k + 1}", heading, figures=(course(s, k),))
 
 
 def course(solution: Solution, scenario: int = 0, names: Sequence[str] | None = None) -> Figure:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from dfsm.errors import DfsmError
+from dfsm.report import first_screen, sections
 from dfsm.report import runs as by_run
-from dfsm.report import sections
 from dfsm.report.document import document, write_document
 from dfsm.report.elements import Markup, element, join, plural
 from dfsm.report.figures import page_data
@@ -57,21 +57,40 @@ def _page(validations: Mapping[str, Validation], title: str) -> str:
 
 
 def _header(validations: Mapping[str, Validation], title: str) -> Markup:
+    """Verdict and figure before anything else: a reader may stop there."""
+    return element(
+        "header",
+        element("h1", title),
+        first_screen.verdict(validations),
+        _figure("verdict-plot", "Error of every signal"),
+        element("p", id="verdict-key", cls="note"),
+        first_screen.cautions(validations),
+    )
+
+
+def _how(validations: Mapping[str, Validation]) -> Markup:
     names = {r.recorded.name for v in validations.values() for r in v.runs}
     models = plural(len(validations), "fitted model")
-    lede = (
+    text = (
         f"{models}, {plural(len(names), 'test run')}. Every model variant is simulated from the "
         "recorded initial state with the recorded inputs of each test run, and its states and "
         "outputs are compared with the recorded ones along its own rollout. Figures "
-        "in the tables come from all samples; the curves are thinned to about 5 Hz for display."
+        "in the tables come from all samples; the curves are thinned to about 5 Hz for display, "
+        "and further where that cannot be seen."
     )
-    return element("header", element("h1", title), element("p", lede, cls="lede"))
+    return element("p", text, cls="note")
 
 
 def _main(validations: Mapping[str, Validation]) -> Markup:
-    heads = [sections.headline(name, v) for name, v in validations.items()]
     parts = [
-        _section("summary", "Summary", join(*heads), sections.glance(validations)),
+        _section(
+            "summary",
+            "Summary",
+            *[sections.completions(name, v) for name, v in validations.items()],
+            sections.glance(validations),
+            _per_model(validations, sections.verdicts),
+            _how(validations),
+        ),
         _controls(),
         _section("accuracy", "Accuracy", _per_model(validations, sections.accuracy)),
         _section(
