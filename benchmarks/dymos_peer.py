@@ -83,7 +83,7 @@ def by_dfsm(model: dfsm.DFSM) -> tuple[dfsm.Solution, float]:
     problem = dfsm.OptimalControlProblem(
         model=model,
         horizon=(0.0, HORIZON),
-        cost=lambda t, x, u, w, p: x[0] ** 2 + u[0] ** 2 / 10,  # noqa: ARG005
+        cost=lambda s: s.x.q**2 + s.u.u**2 / 10,
         bounds={"u": (-LIMIT, LIMIT)},
         initial=dict(zip(states, (1.0, 0.0), strict=True)),
         final=dict(zip(states, (0.0, 0.0), strict=True)),

@@ -13,6 +13,7 @@ import pytest
 import dfsm as package
 import fits
 from conftest import Dfsm
+from dfsm.core.bundle import MANIFEST
 from dfsm.report.blobs import Blobs
 from dfsm.report.figures import coarsest
 from dfsm.report.first_screen import cautions, grades, verdict
@@ -131,5 +132,5 @@ def test_a_model_card_tells_what_the_model_holds(tmp_path, dfsm: Dfsm):
     done = dfsm("report", tmp_path / "cart", "-o", tmp_path / "card.html")
     assert f"wrote {tmp_path / 'card.html'}" in done.out
     assert "Model card: cart" in (tmp_path / "card.html").read_text(encoding="utf-8")
-    into = dfsm("report", tmp_path / "cart", "-o", tmp_path / "cart" / "model.json")
+    into = dfsm("report", tmp_path / "cart", "-o", tmp_path / "cart" / MANIFEST)
     assert into.code == 2

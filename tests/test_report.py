@@ -308,6 +308,7 @@ def test_prediction_intervals_are_drawn_and_told(validation, broken, page, tmp_p
     calm, runaway = shaded.rows("Channel", "Unit", "smallest")
     for row, c in zip(calm, validation.channels, strict=True):
         shares = found.coverage(c.name)
+        assert shares
         figures = (np.mean(shares), min(shares), max(shares))
         assert row[4:] == ["80 %", *(f"{100 * share:.1f} %" for share in figures)]
     assert all(row[4:] == ["80 %", "—", "—", "—"] for row in runaway)

@@ -60,7 +60,7 @@ class DFSMComp(om.ExplicitComponent):
             shape = (1,) if group == "parameters" else (nodes,)
             for c, middle in zip(getattr(s, group), _middles(model, group), strict=True):
                 units = unit_of(c.unit)
-                self.add_input(named[c.name], val=np.full(shape, middle), units=units)
+                self.add_input(named[c.name], val=float(middle), shape=shape, units=units)
         rows = [*((f"d {c.name}/dt", _rate(c.unit)) for c in s.states)]
         rows += [(c.name, unit_of(c.unit)) for c in s.outputs]
         for key, units in rows:
@@ -78,15 +78,15 @@ class DFSMComp(om.ExplicitComponent):
                     self._pairs.append((i, j, of, wrt))
         self._of = [named[key] for key, _ in rows]
 
-    def compute(self, inputs: Any, outputs: Any) -> None:
+    def compute(self, inputs: Any, outputs: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Evaluate f̂ and ĝ at all nodes."""
-        values = np.asarray(_values(self.options["model"], self._points(inputs)))
+        values = np.asarray(_values(self.options["model"], jnp.asarray(self._points(inputs))))
         for name, column in zip(self._of, values.T, strict=True):
             outputs[name] = column
 
-    def compute_partials(self, inputs: Any, partials: Any) -> None:
+    def compute_partials(self, inputs: Any, partials: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Evaluate the exact Jacobians at all nodes."""
-        slopes = np.asarray(_slopes(self.options["model"], self._points(inputs)))
+        slopes = np.asarray(_slopes(self.options["model"], jnp.asarray(self._points(inputs))))
         for i, j, of, wrt in self._pairs:
             partials[of, wrt] = slopes[:, i, j]
 

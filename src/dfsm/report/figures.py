@@ -144,7 +144,9 @@ def coarsest(values: Array) -> int:
         A power of two that ends at the last sample. Lines through every so many samples are
         off by less than a third of a pixel where a panel is as high as the range of the values.
     """
-    allowed = _UNSEEN * float(np.ptp(values)) if np.isfinite(values).all() else -1.0
+    if not np.isfinite(values).all():
+        return 1
+    allowed = _UNSEEN * float(np.ptp(values))
     factor, places = 1, np.arange(len(values))
     while (len(values) - 1) % (2 * factor) == 0 and 2 * factor < len(values):
         kept = places[:: 2 * factor]

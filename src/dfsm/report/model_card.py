@@ -188,7 +188,7 @@ def _inside(model: DFSM, record: Mapping[str, Any]) -> Section:
 def _cite(record: Mapping[str, Any]) -> Section:
     versions = record.get("versions", {})
     made = versions.get("dfsm", __version__)
-    told = listed([f"{k} {v}" for k, v in versions.items()])
+    told = listed([f"{k} {v}" for k, v in versions.items()]) if versions else ""
     texts = [
         f"The dfsm developers. dfsm: derivative function surrogate models from time-domain "
         f"simulations, version {made}. Apache-2.0.",
