@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +19,12 @@ from dfsm.errors import DfsmError, hushed
 from dfsm.loops.adaptive import AdaptiveResult, Agreement, Realised, Round
 from dfsm.loops.load_cases import Figures
 from dfsm.loops.sweep import Sweep, Swept
+from dfsm.loops.tuning_result import TuneStatus, TuningResult
 from dfsm.models.summary import lines_of
 from dfsm.report.result_figures import extremes
 from dfsm.selection.compare import RankedCandidate, Ranking
 from dfsm.selection.trial import Outcome
+from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus
 from dfsm.simulation.simulate import Status
 from dfsm.validation.intervals import Intervals
 
@@ -196,6 +200,27 @@ def test_comparisons_are_drawn_as_ratios_errors_and_rounds():
     empty = replace(sweep, controllers=(sweep.controllers[1],), recorded=sweep.controllers[1])
     with pytest.raises(DfsmError, match="no controller completed all runs"):
         empty.plot()
+
+
+def tuned():
+    """A tuning whose loops are known."""
+    run = solution().trajectory
+    measure = SimpleNamespace(channel="x", label="std of x", weight=1.0)
+    problem: Any = SimpleNamespace(objective=(measure,), measures=(measure,), parameters={})
+    after = ClosedLoopRun(run, LoopStatus.COMPLETED, 4.0, "", 0.0)
+    before = replace(after, trajectory=replace(run, values=3 * run.values))
+    return TuningResult(
+        problem, None, {}, {}, np.array([2.0]), np.array([4.0]), 2.0, 4.0, 0.0, TuneStatus.SOLVED,
+        (), (), (after,), (before,), {}, 1, 1, 0.1,
+    )  # fmt: skip
+
+
+def test_a_tuning_is_drawn_before_and_after():
+    figure = tuned().plot()
+    assert [a.text for a in figure.layout.annotations] == ["x (m)"]
+    np.testing.assert_array_equal(traces(figure, "tuned")[0].y, 1e5 + TIME)
+    np.testing.assert_array_equal(traces(figure, "before")[0].y, 3 * (1e5 + TIME))
+    assert "std of x" in Text(tuned()._repr_html_()).words
 
 
 def test_print_draws_what_the_screen_draws(validation):

@@ -10,6 +10,7 @@ from dfsm.control.solution import Solution
 from dfsm.data.trajectory import Trajectory, labels
 from dfsm.loops.adaptive import AdaptiveResult
 from dfsm.loops.sweep import Sweep
+from dfsm.loops.tuning_result import TuningResult
 from dfsm.models.dfsm import DFSM
 from dfsm.report.article import Table
 from dfsm.report.closed_loop_article import over_runs
@@ -17,6 +18,7 @@ from dfsm.report.elements import Markup, element, join, plural
 from dfsm.report.first_screen import main_channels
 from dfsm.report.model_tables import signal_table, verdict_table
 from dfsm.report.solution_page import outcome
+from dfsm.report.tuning_article import measures
 from dfsm.selection.compare import Ranking
 from dfsm.simulation.closed_loop import ClosedLoopRun
 from dfsm.simulation.simulate import Simulation
@@ -162,6 +164,11 @@ def _sweep(result: Sweep) -> Told:
     notes = [text for c in result.controllers for text in c.endings]
     verdict = f"{plural(len(result.controllers), 'controller')} over {len(result.runs)} runs"
     return Told(verdict, (table,), tuple(notes))
+
+
+@told.register
+def _tuning(result: TuningResult) -> Told:
+    return Told(result.message, (measures(result),))
 
 
 @told.register

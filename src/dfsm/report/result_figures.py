@@ -15,6 +15,7 @@ from dfsm.errors import DfsmError, near_matches
 from dfsm.loops.adaptive import AdaptiveResult
 from dfsm.loops.load_cases import Figures
 from dfsm.loops.sweep import Sweep
+from dfsm.loops.tuning_result import TuningResult
 from dfsm.report.article import Curve, Figure, Panel
 from dfsm.report.figures import within_reason
 from dfsm.report.first_screen import main_channels
@@ -157,6 +158,20 @@ def _loops(
         known = {label: part for label, part in parts.items() if name in part[0]}
         panels.append(_beside(name, _label(result, name), known))
     return Figure("closed_loop", chosen.recorded.name, tuple(panels), stacked=True)
+
+
+@figure_of.register
+def _tuning(
+    result: TuningResult, channels: Sequence[str] | None, run: int | str = 0, **_which: Any
+) -> Figure:
+    k = _index(run, [loop.trajectory.name for loop in result.loops])
+    new, old = result.loops[k].trajectory, result.before_loops[k].trajectory
+    usual = list(dict.fromkeys(m.channel for m in result.problem.measures))
+    panels = []
+    for name in _named(channels, new.names, usual):
+        parts = {"before": (old, 2), "tuned": (new, 1)}
+        panels.append(_beside(name, new.channel(name).label, parts))
+    return Figure("tuning", new.name, tuple(panels), stacked=True)
 
 
 @figure_of.register

@@ -22,7 +22,7 @@ def tuning_article(result: TuningResult) -> Article:
     """What a page and the terminal show of a tuning."""
     sections = [
         Section("parameters", "Parameters", (result.message,), (_parameters(result),)),
-        Section("measures", "Before and after", tables=(_measures(result),)),
+        Section("measures", "Before and after", tables=(measures(result),)),
         Section("runs", "Each run", tables=(_by_run(result),)),
     ]
     if len(result.starts) > 1:
@@ -60,7 +60,8 @@ def _parameters(result: TuningResult) -> Table:
     )
 
 
-def _measures(result: TuningResult) -> Table:
+def measures(result: TuningResult) -> Table:
+    """Every measure before and after, and the objective that they make."""
     rows = []
     for measure, before, after in zip(
         result.problem.measures, result.before_figures, result.figures, strict=True
