@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -131,6 +132,10 @@ def test_a_model_card_tells_what_the_model_holds(tmp_path, dfsm: Dfsm):
     package.save(model, tmp_path / "cart")
     done = dfsm("report", tmp_path / "cart", "-o", tmp_path / "card.html")
     assert f"wrote {tmp_path / 'card.html'}" in done.out
-    assert "Model card: cart" in (tmp_path / "card.html").read_text(encoding="utf-8")
+    page = (tmp_path / "card.html").read_text(encoding="utf-8")
+    assert "Model card: cart" in page
+    # Scripts look parts up by their names.
+    names = re.findall(r'<[a-z]+[^<>]* id="([^"]+)"', page)
+    assert len(names) == len(set(names))
     into = dfsm("report", tmp_path / "cart", "-o", tmp_path / "cart" / MANIFEST)
     assert into.code == 2

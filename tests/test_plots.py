@@ -157,6 +157,8 @@ def test_a_solution_is_drawn_with_its_bounds():
     assert [a.text for a in figure.layout.annotations] == ["u (N)", "x (m)"]
     np.testing.assert_array_equal(traces(figure, "scenario 2")[0].y, 2 * np.sin(TIME))
     np.testing.assert_array_equal(traces(figure, "bounds")[0].y, np.full(9, -0.9))
+    # 4 m on top of 100 km are no rounding errors.
+    assert figure.layout.yaxis2.range is None
     with pytest.raises(DfsmError, match="scenario is 2, expected 0 to 1"):
         found.plot(scenario=2)
 

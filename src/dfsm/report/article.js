@@ -88,6 +88,7 @@
       dragmode: coarse.matches ? false : "zoom",
       xaxis: axis(stacked && !last ? "" : panel.x, panel.log.includes("x"), {
         ...labels(panel.x_ticks),
+        ...(panel.x_range ? { range: panel.x_range } : {}),
         ...(stacked ? { automargin: false } : {}),
       }),
       yaxis: axis(panel.y, panel.log.includes("y"), {

@@ -103,7 +103,7 @@ class Panel:
         Axes that are logarithmic: "", "x", "y" or "xy".
     ticks, x_ticks
         Labels for values of y and of x, in place of numbers.
-    y_range
+    y_range, x_range
         None takes all that is drawn.
     """
 
@@ -115,6 +115,7 @@ class Panel:
     ticks: tuple[tuple[float, str], ...] = ()
     x_ticks: tuple[tuple[float, str], ...] = ()
     y_range: tuple[float, float] | None = None
+    x_range: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

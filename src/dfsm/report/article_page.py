@@ -109,6 +109,7 @@ def _panel(panel: Panel, blobs: Blobs) -> dict[str, Any]:
         "ticks": [list(tick) for tick in panel.ticks],
         "x_ticks": [list(tick) for tick in panel.x_ticks],
         "range": panel.y_range,
+        "x_range": panel.x_range,
         "curves": [_curve(c, blobs) for c in panel.curves],
     }
 

@@ -14,7 +14,7 @@ _TIME = "time (s)"
 # Bounds further away than this share of a signal's range would flatten it: they are not drawn.
 _FAR = 1.5
 # What varies less than this share of its size is drawn as still, with this share around it.
-_STILL, _MARGIN = 1e-3, 0.05
+_STILL, _MARGIN = 1e-5, 0.05
 
 
 def stacked_figure(

@@ -129,7 +129,9 @@ def _errors(verdicts: Sequence[Mapping[str, Any]]) -> Figure:
         Curve("this model", errors, places, 1, "points"),
     )
     ticks = tuple((float(p), v["name"]) for p, v in zip(places, verdicts, strict=True))
-    panel = Panel("", "error / spread of the record (NRMSE)", "", curves, ticks=ticks)
+    far = max(1.0, 1.1 * float(errors.max()))
+    title = "error / spread of the record (NRMSE)"
+    panel = Panel("", title, "", curves, ticks=ticks, x_range=(0.0, far))
     return Figure("errors-plot", "Rollouts over the training runs.", (panel,))
 
 
@@ -156,7 +158,7 @@ def _trained(record: Mapping[str, Any]) -> Section:
     )
     heads = ("run", "samples", "seconds", "SHA-256, first 12")
     tables = (Table("data", "Training runs", heads, rows, digits=6),) if rows else ()
-    return Section("data", "What taught it", (text,), tables)
+    return Section("training", "What taught it", (text,), tables)
 
 
 # -- inside ---------------------------------------------------------------------------------------

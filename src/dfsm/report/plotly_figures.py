@@ -114,8 +114,9 @@ def _axis(panel: Panel, letter: str, title: str) -> dict[str, Any]:
             "ticktext": [_text(text) for _, text in ticks],
             "automargin": True,
         }
-    if letter == "y" and panel.y_range and not log:
-        axis["range"] = list(panel.y_range)
+    span = panel.y_range if letter == "y" else panel.x_range
+    if span and not log:
+        axis["range"] = list(span)
     return axis
 
 

@@ -166,6 +166,8 @@ def _panel(place: Axes, panel: Panel) -> None:
         place.set_yscale("log")
     if panel.y_range:
         place.set_ylim(*panel.y_range)
+    if panel.x_range:
+        place.set_xlim(*panel.x_range)
     if panel.x_ticks:
         values, texts = zip(*panel.x_ticks, strict=True)
         place.set_xticks(values, [_plain(t) for t in texts])

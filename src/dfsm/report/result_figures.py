@@ -197,7 +197,7 @@ def _sweep(result: Sweep, channels: Sequence[str] | None, **_which: Any) -> Figu
     kinds = {
         "standard deviation": lambda f: f.std,
         "mean absolute rate": lambda f: f.travel,
-        f"damage-equivalent load, m = {SHOWN_EXPONENT}": lambda f: f.damage[SHOWN_EXPONENT],
+        f"damage-equivalent load (m = {SHOWN_EXPONENT})": lambda f: f.damage[SHOWN_EXPONENT],
     }
     panels = []
     for title, of in kinds.items():
@@ -209,8 +209,17 @@ def _sweep(result: Sweep, channels: Sequence[str] | None, **_which: Any) -> Figu
             at = len(names) - 1 - np.array(rows, dtype=float) - shift
             curves.append(Curve(swept.name, np.array(ratios), at, k + 1, "points"))
         ticks = tuple((len(names) - 1.0 - i, n) for i, n in enumerate(names))
-        title = f"{title} over that of {base.name}"
-        panels.append(Panel(title, "ratio", "", tuple(curves), ticks=ticks))
+        most = max(1.0, *(float(x) for c in curves for x in c.x))
+        panels.append(
+            Panel(
+                title,
+                f"over that of {base.name}",
+                "",
+                tuple(curves),
+                ticks=ticks,
+                x_range=(0.0, 1.1 * most),
+            )
+        )
     return Figure("sweep", f"Controllers over {len(result.runs)} runs", tuple(panels))
 
 
@@ -235,7 +244,8 @@ def _ranking(result: Ranking, channels: Sequence[str] | None, **_which: Any) -> 
         for p, e in zip(places, entries, strict=True)
     )
     title = f"mean NRMSE over {len(result.validation)} runs held out, best first"
-    panel = Panel(title, "NRMSE", "", tuple(curves), ticks=ticks)
+    most = max([1.0, *(float(x) for c in curves for x in c.x)])
+    panel = Panel(title, "NRMSE", "", tuple(curves), ticks=ticks, x_range=(0.0, 1.1 * most))
     return Figure("ranking", "Candidates", (panel,))
 
 
