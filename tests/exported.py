@@ -70,13 +70,20 @@ def whole() -> DFSM:
     by_name = {c.name: c for c in channels}
     settings = (
         Rotor(
-            table=rotor_table(), radius=60.0, wind="RotWind", speed="RotSpeed", pitch="BldPitch1"
+            table=rotor_table(),
+            radius=60.0,
+            wind="RotWind",
+            speed="RotSpeed",
+            pitch="BldPitch1",
+            uncertainty=0.1,
         ),
         Product(factors=("RotSpeed", "heave <z>", "heave <z>")),
         QuadraticDrag(velocity="heave <z>_dot", against="eta_dot"),
         Function(name="friction", function=friction, inputs=("RotSpeed", "heave <z>")),
     )
     parts = tuple(s.term(by_name, columns, dict.fromkeys(columns, 1.0)) for s in settings)
+    # A table that is uncertain, and by how much: what refinement on rollouts leaves.
+    parts = (parts[0].moved([jnp.asarray(rng.normal(size=(2, 6)))]), *parts[1:])
     terms = Terms(parts, jnp.zeros(5), jnp.ones(5))
     #                 torque pitch  wind eta_dot speed heave rate latents     mass
     low = np.array([-5.0, 0.0, 4.0, -1.0, 4.0, -2.0, -1.0, -1.0, -1.0, 1.0])
