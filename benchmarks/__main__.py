@@ -2,6 +2,7 @@
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
     [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [dymos] [fuzz] [kill]
+    [feedback]
 
 Without names all but `peer` and `dymos`, which make environments of their own and install
 jax-sysid and dymos there, and `fuzz` and `kill`, which damage inputs and end commands for hours
@@ -25,6 +26,7 @@ from benchmarks import (
     derivatives,
     dymos_peer,
     exports,
+    feedback,
     field,
     fuzz,
     kill,
@@ -42,6 +44,7 @@ from dfsm.core.files import json_value
 PARTS: dict[str, Callable[..., object]] = {
     "derivatives": derivatives.run,
     "field": field.run,
+    "feedback": feedback.run,
     "accuracy": accuracy.run,
     "speed": speed.run,
     "parameters": parameters.run,

@@ -293,3 +293,29 @@ def test_an_input_that_is_held_and_new_at_every_sample_is_told():
     assert any("set inputs: {u: hold}" in note for note in notes)
     chosen = fit([run(np.arange(800.0), x=held, u=u)], replace(SETTINGS, inputs="hold")).model
     assert_allclose(chosen.f.coefficients[0, 0], [0.4, -0.4], rtol=1e-3)
+
+
+def test_a_loop_that_is_excited_a_little_is_not_believed_either():
+    rng = np.random.default_rng(4)
+    force = 0.1 * slow(rng, 900, 30)
+    wanted = 0.5 * slow(rng, 900, 10)
+    at = np.arange(900.0)
+
+    def control(x, i, k):
+        return np.interp(k, at, wanted) - 1.0 * x - 0.05 * i
+
+    model, notes = told([plant(control, force, 900)])
+    first = float(model.f.coefficients[0, 0, 0])
+    assert first < 0.7 * B  # what the note is about
+    (note,) = [n for n in notes if n.startswith("x_dot: what the fit leaves over is correlated")]
+    second = float(note.split("modelled ")[1].split(" ")[0])
+    assert abs(second - B) < abs(first - B) / 2
+    assert model.provenance.record["verdicts"][0]["verdict"] != "usable"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sines_in_open_loop_are_believed(seed):
+    rng = np.random.default_rng(seed)
+    force = 0.05 * slow(rng, 900, 30)
+    rates, phases = rng.uniform(0.05, 0.4, 4), rng.uniform(0, 6, 4)
+    quietly([plant(lambda x, i, k: np.sin(rates * k + phases).sum(), force, 900)])

@@ -15,6 +15,7 @@ import numpy as np
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.derivatives import kinematic_rows
+from dfsm.fitting.coloured import pulled, pulled_note
 from dfsm.fitting.delays import late_input, late_note
 from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
@@ -145,6 +146,18 @@ def doubts(
             reasons.append(
                 Reason(name, "late", f"'{names[found.column]}' acts late on it", "the delay told")
             )
+        elif series is not None and fit.model.schedule is None:
+            free = [c for c in range(len(samples.signals.controls)) if c not in held]
+            for twice in pulled(series, free):
+                notes.append(pulled_note(name, names[twice.column], twice))
+                reasons.append(
+                    Reason(
+                        name,
+                        "feedback",
+                        f"the effect of '{names[twice.column]}' is pulled",
+                        _EXCITE,
+                    )
+                )
     return Doubts(tuple(notes), errors, tuple(reasons))
 
 
