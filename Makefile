@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Modules are compiled when they are first imported: of all that is installed, a few are.
+PIP_OPTIONS := --quiet --disable-pip-version-check --no-compile
 # Long files first, each file in one process: its models are fitted once.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
@@ -36,6 +38,7 @@ contracts: $(VENV)/.installed-dev
 
 # What would be published, looked at and used from an environment of its own.
 wheel: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install $(PIP_OPTIONS) -e '.[dev,release]'
 	rm -rf dist
 	$(BIN)/python -m build --wheel
 	$(BIN)/twine check --strict dist/*.whl
@@ -52,9 +55,9 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[openfast]'
+	$(BIN)/python -m pip install $(PIP_OPTIONS) -e '.[openfast]'
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install $(PIP_OPTIONS) -e '.[dev]'
 	touch $@ $(VENV)/.installed

@@ -7,6 +7,7 @@ python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scal
 Without names all but `peer` and `dymos`, which make environments of their own and install
 jax-sysid and dymos there, and `fuzz` and `kill`, which damage inputs and end commands for hours
 (``fuzz --inputs 20000``).
+``[startup] [--before COMMIT]`` measures cold processes, of an earlier build beside this one.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import argparse
 import json
 import os
 import platform
+import sys
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import dfsm
 from benchmarks import (
@@ -37,6 +40,7 @@ from benchmarks import (
     rollouts,
     scaling,
     speed,
+    startup,
     unseen,
 )
 from dfsm.core.files import json_value
@@ -47,6 +51,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "feedback": feedback.run,
     "accuracy": accuracy.run,
     "speed": speed.run,
+    "startup": startup.run,
     "parameters": parameters.run,
     "scaling": scaling.run,
     "rollouts": rollouts.run,
@@ -70,21 +75,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--inputs", type=int, default=20_000, help="of fuzz")
+    parser.add_argument("--before", metavar="COMMIT", help="of startup: an earlier build")
     parser.add_argument("--seed", type=int, default=0, help="of fuzz")
     arguments = parser.parse_args()
     names = arguments.parts or [n for n in PARTS if n not in NAMED]
     unknown = [n for n in names if n not in PARTS]
     if unknown:
         parser.error(f"no part '{unknown[0]}'; choose from {', '.join(PARTS)}")
-    figures: dict[str, object] = {
+    figures: dict[str, Any] = {
         "dfsm": dfsm.__version__,
         "python": platform.python_version(),
         "processors": os.cpu_count(),
     }
     warnings.simplefilter("ignore", dfsm.DfsmWarning)
     for name in names:
-        given = (arguments.inputs, arguments.seed) if name == "fuzz" else ()
-        figures[name] = PARTS[name](*given)
+        told = {"fuzz": (arguments.inputs, arguments.seed), "startup": (arguments.before,)}
+        figures[name] = PARTS[name](*told.get(name, ()))
+        if name == "startup":
+            print("\n".join(startup.startup_table(figures[name])), file=sys.stderr)
     print(json.dumps(json_value(figures), indent=2))
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import control_tables, field, fit_tables, turbine_tables, unseen
+from benchmarks import control_tables, field, fit_tables, startup, turbine_tables, unseen
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -25,6 +25,7 @@ TABLES = {
     "parameters": fit_tables.parameters_table,
     "scaling": fit_tables.scaling_table,
     "unseen": unseen.unseen_table,
+    "startup": startup.startup_table,
 }
 ROLLOUT_TABLES = {
     "rollouts": turbine_tables.rollouts_table,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,8 +55,11 @@ REFINEMENT = dfsm.RefineSettings(
     network=16,
     decay=3.0,
 )
+# Refined on rollouts, which takes most of the time.
+SLOW = ("all winds", FOR_CONTROL)
 BELOW_RATED = "06"
 HUB_HEIGHT = 150.0  # m
+Result = tuple[dfsm.FitResult, dfsm.Validation]
 PERTURBED = {
     False: ("06mps_s01", "12mps_s01", "12mps_s02", "12mps_s03", "18mps_s01"),
     True: ("06mps_s02", "12mps_s04", "18mps_s02"),
@@ -151,7 +154,7 @@ def below_rated() -> dfsm.FitResult:
     return dfsm.fit([*training, *open_loop], choices, refinement)
 
 
-def fit_and_validate(_: None, label: str) -> tuple[dfsm.FitResult, dfsm.Validation]:
+def fit_and_validate(_: None, label: str) -> Result:
     """One of the models, and how it does on its test runs."""
     winds = WINDS[label]
     training, tests = runs(winds, range(1, 9)), runs(winds, range(9, 11))
@@ -167,13 +170,23 @@ def fit_and_validate(_: None, label: str) -> tuple[dfsm.FitResult, dfsm.Validati
 
 
 def study(
-    labels: Sequence[str] = tuple(WINDS), jobs: int | None = None
-) -> dict[str, tuple[dfsm.FitResult, dfsm.Validation]]:
-    """Fit the models, or some of them, and validate each on its test runs, so many at a time."""
-    slow = ("all winds", FOR_CONTROL)  # and so they go first
-    tasks = sorted(labels, key=lambda label: label not in slow)
+    labels: Sequence[str] = tuple(WINDS),
+    jobs: int | None = None,
+    first: Callable[[Mapping[str, Result]], object] = lambda _: None,
+) -> dict[str, Result]:
+    """Fit the models, or some of them, and validate each on its test runs, so many at a time.
+
+    `first` is called with the models that are not refined once all of these are there.
+    """
+    # The quick ones go first, and may be looked at while the others are fitted.
+    tasks = sorted(labels, key=lambda label: label in SLOW)
+    fits: dict[str, Result] = {}
     work = work_through(fit_and_validate, None, tasks, jobs or processors())
-    fits = dict(track(work, "models", len(tasks)))
+    for label, result in track(work, "models", len(tasks)):
+        fits[label] = result
+        quick = [name for name in labels if name not in SLOW]
+        if label in quick and all(name in fits for name in quick):
+            first({name: fits[name] for name in quick})
     return {label: fits[label] for label in labels}
 
 
@@ -183,14 +196,26 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")
     output = parser.parse_args().output
     output.mkdir(parents=True, exist_ok=True)
-    begin = time.perf_counter()
+    begin, report = time.perf_counter(), output / "report.html"
+
+    def publish(results: Mapping[str, Result]) -> dict[str, dfsm.Validation]:
+        validations = {label: validation for label, (_, validation) in results.items()}
+        dfsm.write_report(validations, report, title="IEA 15 MW floating turbine")
+        return validations
+
+    def first(results: Mapping[str, Result]) -> None:
+        publish(results)
+        print(
+            f"{time.perf_counter() - begin:.0f} s: {', '.join(results)} in {report.resolve()}; "
+            "the refined models follow",
+            flush=True,
+        )
+
     with dfsm.show_progress():
-        results = study()
+        results = study(first=first)
         for label, (fitted, _) in results.items():
             dfsm.save(fitted.model, folder(output, label), fitted.nonlinear)
-        validations = {label: validation for label, (_, validation) in results.items()}
-        report = output / "report.html"
-        dfsm.write_report(validations, report, title="IEA 15 MW floating turbine")
+        validations = publish(results)
     write_json(output / "metrics.json", {k: v.to_dict() for k, v in validations.items()})
     print_validations(validations)
     print(f"\n{time.perf_counter() - begin:.0f} s in all; report: {report.resolve()}")

@@ -10,6 +10,7 @@ import io
 import os
 import signal
 import sys
+import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -44,6 +45,7 @@ from dfsm.cli.terminal import (
     print_json,
     say,
     tell_notes,
+    tell_timings,
     working,
 )
 from dfsm.cli.tune import tune
@@ -129,11 +131,15 @@ def fit(
             "cubic, or by name, u=hold,w=cubic."
         ),
     ] = None,
+    timings: Annotated[
+        bool, typer.Option("--timings", help="Print where the time went, on standard error.")
+    ] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit a multi-fidelity model and save it as a folder."""
     from dfsm.config.fit import load_config
+    from dfsm.core.compile_clock import compile_clock
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import visible
     from dfsm.core.lock import locked
@@ -144,6 +150,7 @@ def fit(
 
     check_target(output)
     chosen = parse_chosen(interpolation)
+    begin, compiling = time.perf_counter(), compile_clock()
     with locked(output):
         with working(quiet):
             config_settings, runs = load_config(config)
@@ -156,6 +163,8 @@ def fit(
             model = result.model
         replaced = output.exists() and bool(visible(output))
         write_or_keep(lambda path: save(model, path, result.nonlinear), output)
+    if timings:
+        tell_timings(result.seconds, time.perf_counter() - begin, compiling())
     if replaced and not quiet:
         print(printable(f"note: replaced the model that was in {output}"), file=sys.stderr)
     if as_json:

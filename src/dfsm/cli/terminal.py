@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -105,6 +105,29 @@ def tell_notes(runs: Iterable[Trajectory], quiet: bool) -> None:
 
     for text in () if quiet else counted([(run.where, run.notes) for run in runs]):
         print(printable(f"note: {text}"), file=sys.stderr)
+
+
+def tell_timings(steps: Mapping[str, float], total: float, compiled: tuple[float, int]) -> None:
+    """Print where the time went, on standard error.
+
+    Parameters
+    ----------
+    steps
+        Seconds of each step of a fit.
+    total
+        Seconds from the command's start, imports not counted.
+    compiled
+        Seconds that went into compiling during all of it, and the number of programs.
+    """
+    parts = {**steps, "reading and saving": total - sum(steps.values())}
+    width = max(map(len, parts))
+    for name, seconds in parts.items():
+        print(f"{name:{width}} {seconds:8.2f} s", file=sys.stderr)
+    print(
+        f"{'in all':{width}} {total:8.2f} s, of which compiling {compiled[0]:.2f} s "
+        f"({compiled[1]} programs)",
+        file=sys.stderr,
+    )
 
 
 def lines(text: str) -> str:

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError, expm, solve_discrete_are
 
 from dfsm.controllers.rosco_blocks import unwound, within
 from dfsm.core.settings import require
@@ -178,11 +178,11 @@ def regulator_gain(
     F, G, q, r = (np.asarray(a, dtype=float) for a in (A, B, Q, R))
     n, m = G.shape
     # With the controls among the states, which hold.
-    moves = expm(np.block([[F, G], [np.zeros((m, n + m))]]) * interval)
+    moves = scipy.linalg.expm(np.block([[F, G], [np.zeros((m, n + m))]]) * interval)
     Ad, Bd = moves[:n, :n], moves[:n, n:]
     try:
-        P = solve_discrete_are(Ad, Bd, q, r)
-    except (LinAlgError, ValueError) as error:
+        P = scipy.linalg.solve_discrete_are(Ad, Bd, q, r)
+    except (scipy.linalg.LinAlgError, ValueError) as error:
         raise DfsmError(
             f"there is no linear-quadratic regulator ({error}): weight every state that does not "
             "decay by itself, and leave out those that the controls do not reach"

@@ -1,6 +1,6 @@
-"""How JAX is set up: 64-bit arithmetic, and small loops compiled in one piece.
+"""How JAX is set up: 64-bit arithmetic, small loops compiled in one piece, compiled code kept.
 
-Both are settings of the process, made when the first part of dfsm that computes with JAX is
+These are settings of the process, made when the first part of dfsm that computes with JAX is
 imported; ``import dfsm`` alone, reading and writing of files change nothing.
 
 Derivatives of noisy records, steps of a solver and tolerances of 1e-8 need 64 bits. JAX decides
@@ -23,6 +23,7 @@ import warnings
 import jax
 from jaxlib import xla_client
 
+from dfsm.core.compile_cache import keep_compiled
 from dfsm.errors import DfsmWarning
 
 _SMALL_LOOP = 2_000_000
@@ -62,3 +63,4 @@ def _keep_small_loops_whole() -> None:
 
 _use_64_bits()
 _keep_small_loops_whole()
+keep_compiled()

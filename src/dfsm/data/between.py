@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
@@ -233,6 +233,6 @@ def polynomials(time: Array, values: Array, kinds: Sequence[Between]) -> Array:
         for before, last in pairwise(ends):
             part = slice(before + 1, last + 1)
             if last > before + 1:
-                spline = CubicSpline(time[part], values[part][:, smooth]).c
+                spline = scipy.interpolate.CubicSpline(time[part], values[part][:, smooth]).c
                 c[4 - len(spline) :, part.start : last, smooth] = spline
     return c

@@ -7,11 +7,12 @@ run's own channels in one way, for training, simulation and optimization alike.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
@@ -20,6 +21,11 @@ from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.numerics.smoothing import smoothing_spline
+
+# Rates by a digest of what they are the rates of: a run meets a model several times, and each time
+# its features are computed. So many of so many bytes at most.
+_slopes: dict[tuple[bytes, float | None], Array] = {}
+_MOST_KNOWN, _LARGEST_KNOWN = 32, 1_000_000
 
 
 @settings_class
@@ -160,9 +166,22 @@ def _require_one_unit(run: Trajectory, source: Channel, other: Channel) -> None:
 def _rate(run: Trajectory, feature: Feature) -> Array:
     try:
         step = run.channel(feature.source).step
-        return smoothing_spline(run.time, run[feature.source], step).first
+        return _slope(run.time, run[feature.source], step)
     except DfsmError as error:
         raise DfsmError(f"{run.where}: feature '{feature.name}': {error}") from None
+
+
+def _slope(time: Array, values: Array, step: float | None) -> Array:
+    """First derivative of a smoothing spline; that of the last runs is known already."""
+    key = hashlib.sha256(time.tobytes() + values.tobytes()).digest(), step
+    slope = _slopes.get(key)
+    if slope is None:
+        slope = smoothing_spline(time, values, step).first
+        if slope.nbytes <= _LARGEST_KNOWN:
+            if len(_slopes) >= _MOST_KNOWN:
+                _slopes.pop(next(iter(_slopes)), None)
+            _slopes[key] = slope
+    return slope
 
 
 def _lagged(run: Trajectory, feature: Feature) -> Array:
@@ -176,4 +195,4 @@ def _lagged(run: Trajectory, feature: Feature) -> Array:
     decay = float(np.exp(-ratio))
     held = -float(np.expm1(-ratio)) / ratio
     now, before = 1 - held, held - decay
-    return lfilter([now, before], [1.0, -decay], u, zi=[u[0] * (1 - now)])[0]
+    return scipy.signal.lfilter([now, before], [1.0, -decay], u, zi=[u[0] * (1 - now)])[0]

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from dfsm.core.types import Array
 from dfsm.fitting.residuals import Residuals, stacked
@@ -100,7 +100,7 @@ def _regressed(u: Array, inputs: Array) -> tuple[Array, float]:
 
 def _lagged(x: Array, lag: float) -> Array:
     decay = float(np.exp(-1 / lag))
-    return lfilter([1 - decay], [1.0, -decay], x, axis=0, zi=decay * x[:1])[0]
+    return scipy.signal.lfilter([1 - decay], [1.0, -decay], x, axis=0, zi=decay * x[:1])[0]
 
 
 def is_feedback(law: Law, A: Array, b: Array) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
+import scipy
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
@@ -350,9 +350,9 @@ class _Parts:
 
 def _band_pass(values: Array, low: float, high: float) -> Array:
     """Zero-phase Butterworth filter between two shares of the Nyquist frequency."""
-    sections = butter(3, [low, high], btype="bandpass", output="sos")
+    sections = scipy.signal.butter(3, [low, high], btype="bandpass", output="sos")
     padding = min(len(values) - 1, int(np.ceil(6 / (high - low))))
-    return sosfiltfilt(sections, values - values.mean(0), axis=0, padlen=padding)
+    return scipy.signal.sosfiltfilt(sections, values - values.mean(0), axis=0, padlen=padding)
 
 
 def _summed(parts: Sequence[_Sums]) -> _Sums:

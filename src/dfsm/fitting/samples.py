@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
+import scipy
 
 from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
@@ -389,7 +389,7 @@ def _azimuth(run: Trajectory, azimuth: Azimuth | None) -> Array:
     if azimuth is None:
         return np.zeros(len(run))
     omega = run[azimuth.speed] * radians_per_second(run.channel(azimuth.speed))
-    turned = cumulative_trapezoid(omega, run.time, initial=0.0)
+    turned = scipy.integrate.cumulative_trapezoid(omega, run.time, initial=0.0)
     if azimuth.angle is None:
         return turned
     angle = np.deg2rad(run[azimuth.angle])

@@ -11,7 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from pydantic import TypeAdapter
 
@@ -199,7 +199,7 @@ def _put_together(
     def arrays(name: str) -> dict[str, Any]:
         start = f"{prefix}/{name}/"
         return {
-            key.removeprefix(start): jnp.asarray(array)
+            key.removeprefix(start): jax.device_put(array)
             for key, array in complete.items()
             if key.startswith(start)
         }

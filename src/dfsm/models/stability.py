@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import eig
+import scipy
 
 from dfsm.core.types import Array, ComplexArray
 from dfsm.models.dfsm import DFSM
@@ -164,7 +164,7 @@ def eigen(A: Array) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     tuple of ndarray
         λ, shape ``(state,)``, and w and v as rows, ``(state, state)``.
     """
-    solution: Any = eig(A, left=True, right=True)
+    solution: Any = scipy.linalg.eig(A, left=True, right=True)
     eigenvalues, left, right = solution[0], solution[1].T, solution[2].T
     # Cosine of the angle between vectors of length one: the eigenvalue's reciprocal condition.
     cosine = np.sum(left.conj() * right, axis=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.signal import butter, sosfiltfilt
 
 from dfsm.core.settings import settings_class
 from dfsm.core.shapes import Series
@@ -138,10 +138,10 @@ def low_pass(time: ArrayLike, values: ArrayLike, cutoff: float) -> Series:
             f"a low_pass cutoff of {cutoff:g} Hz is not between 0 and the Nyquist frequency "
             f"{nyquist:g} Hz of samples {step:g} s apart: lower it"
         )
-    sections = butter(4, cutoff / nyquist, output="sos")
+    sections = scipy.signal.butter(4, cutoff / nyquist, output="sos")
     # SciPy's own padding is a few samples; the filter's memory is about one period of the cutoff.
     padding = min(len(y) - 1, max(15, int(np.ceil(1 / (cutoff * step)))))
-    return sosfiltfilt(sections, y, padlen=padding)
+    return scipy.signal.sosfiltfilt(sections, y, padlen=padding)
 
 
 def filtered(time: Series, values: Series, chosen: Filter | None) -> Series:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+import scipy
 
 from dfsm.core.types import Array
 
@@ -171,10 +171,10 @@ class _Trial:
 def _damped_step(curvature: Array, slope: Array, damping: float) -> tuple[Array, float] | None:
     """Δ, and by how much the quadratic model falls along it; None without enough damping."""
     try:
-        factor = cho_factor(curvature + damping * np.eye(len(slope)), overwrite_a=True)
-    except LinAlgError:
+        factor = scipy.linalg.cho_factor(curvature + damping * np.eye(len(slope)), overwrite_a=True)
+    except scipy.linalg.LinAlgError:
         return None
-    change = -cho_solve(factor, slope)
+    change = -scipy.linalg.cho_solve(factor, slope)
     return change, float(change @ (damping * change - slope))
 
 

@@ -12,14 +12,15 @@ exact: ``tr H = p - d log det(BᵀB + λΩ) / d log λ``, from the Cholesky fact
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from threadpoolctl import threadpool_limits
 
 from dfsm.core.shapes import Series
 from dfsm.core.types import Array, IntArray
@@ -34,6 +35,9 @@ _WIDTH = _DEGREE + 1  # B-splines that are not zero at a point
 _HEAVY, _KEEP, _LIGHT = 8.0, 2.0, 0.1
 _THINNING = _HEAVY / _KEEP  # knot spacing of one level over that of the next finer one
 _STEPS = 8  # values of λ tried per level
+# Products of so many numbers BLAS shares among threads, which wait for one another many times
+# longer than they work.
+_THREADED = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +115,14 @@ def smoothing_spline(time: ArrayLike, values: ArrayLike, step: float | None = No
     mesh = _mesh(t.tobytes())
     z = (y - centre) / scale
     # Noise beyond a thousand times the signal's range leaves a parabola, as a thousand does.
-    choice = _choose(mesh, z, None if known is None else min(known / scale, 1e3) ** 2)
+    variance = None if known is None else min(known / scale, 1e3) ** 2
+    with threadpool_limits(limits=1) if len(z) > _THREADED else nullcontext():
+        choice = _choose(mesh, z, variance)
     if choice is None:
         return SmoothResult(*interpolate(t, y), 0.0, 0.0, float(len(t)), "interpolation")
     level, lam, noise, chosen_by = choice
     c, residual = level.fit(z, lam)
-    spline = BSpline(level.knots, c, _DEGREE)
+    spline = scipy.interpolate.BSpline(level.knots, c, _DEGREE)
     return SmoothResult(
         values=y - scale * residual,
         first=spline(mesh.x, 1) * (scale / mesh.h),
@@ -149,7 +155,7 @@ def cubic_spline(time: ArrayLike, values: ArrayLike) -> tuple[Series, Series, Se
         As `smoothing_spline`.
     """
     t, y = checked(time, values)
-    spline = CubicSpline(t, y)
+    spline = scipy.interpolate.CubicSpline(t, y)
     return y, spline(t, 1), spline(t, 2)
 
 
@@ -168,7 +174,7 @@ def interpolate(time: Series, values: Series) -> tuple[Series, Series, Series]:
     """
     h = (time[-1] - time[0]) / (len(time) - 1)
     x = (time - time[0]) / h
-    spline = make_interp_spline(x, values, k=_DEGREE)
+    spline = scipy.interpolate.make_interp_spline(x, values, k=_DEGREE)
     return values, spline(x, 1) / h, spline(x, 2) / h**2
 
 
@@ -272,7 +278,7 @@ class _Level:
         first, last = np.full(_WIDTH, sites[0]), np.full(_WIDTH, sites[-1])
         self.knots = np.concatenate([first, sites[3:-3], last])
         self.size = len(sites)
-        self.basis = BSpline.design_matrix(x, self.knots, _DEGREE)
+        self.basis = scipy.interpolate.BSpline.design_matrix(x, self.knots, _DEGREE)
         self.transposed = self.basis.T.tocsr()
         rows = np.asarray(self.basis.data, dtype=np.float64).reshape(-1, _WIDTH)
         start = np.asarray(self.basis.indices, dtype=np.int64).reshape(-1, _WIDTH)[:, 0]
@@ -282,12 +288,12 @@ class _Level:
 
     def _factor(self, lam: float) -> Array:
         matrix = self.gram + lam * self.penalty
-        return cholesky_banded(matrix, overwrite_ab=True, check_finite=False)
+        return scipy.linalg.cholesky_banded(matrix, overwrite_ab=True, check_finite=False)
 
     def fit(self, z: Array, lam: float) -> tuple[Array, Array]:
         """Coefficients and residual for one λ."""
         factor = (self._factor(lam), False)
-        c = cho_solve_banded(factor, self.transposed @ z, check_finite=False)
+        c = scipy.linalg.cho_solve_banded(factor, self.transposed @ z, check_finite=False)
         return c, z - self.basis @ c
 
     def degrees_of_freedom(self, lam: float) -> float:
@@ -370,7 +376,8 @@ def _third_derivatives(knots: Array) -> tuple[Array, IntArray]:
     length = np.diff(breaks)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     points = breaks[:-1, None] + length[:, None] * (nodes + 1) / 2
-    parabolas = BSpline.design_matrix(points.ravel(), inner, degree).data.reshape(-1, 3, 3)
+    design = scipy.interpolate.BSpline.design_matrix(points.ravel(), inner, degree)
+    parabolas = design.data.reshape(-1, 3, 3)
     parabolas = parabolas * np.sqrt(length[:, None] * weights / 2)[:, :, None]
     n = len(length)
     rows = np.zeros((n, 3, _WIDTH))

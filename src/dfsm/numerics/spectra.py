@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import trapezoid
-from scipy.signal import welch
 
 from dfsm.core.shapes import Bins, Series
 from dfsm.errors import DfsmError
@@ -48,7 +47,7 @@ class Spectrum:
     def power(self, band: Band) -> float:
         """Variance in a band, in the signal's unit squared."""
         inside = self._inside(band)
-        return float(trapezoid(self.density[inside], self.frequency[inside]))
+        return float(scipy.integrate.trapezoid(self.density[inside], self.frequency[inside]))
 
     def _inside(self, band: Band) -> NDArray[np.bool_]:
         return (self.frequency >= band.low) & (self.frequency <= band.high)
@@ -75,5 +74,5 @@ def spectrum(time: Series, values: Series, segment: float = 200.0) -> Spectrum:
     if step is None:
         raise DfsmError("a spectrum needs an equidistant time mesh: resample the run first")
     size = min(len(values), round(segment / step))
-    frequency, density = welch(values, fs=1 / step, window="hann", nperseg=size)
+    frequency, density = scipy.signal.welch(values, fs=1 / step, window="hann", nperseg=size)
     return Spectrum(frequency, density)

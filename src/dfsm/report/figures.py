@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.signal import resample_poly
+import scipy
 
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
@@ -79,7 +79,7 @@ def thin(run: Trajectory) -> tuple[float, float, Array]:
         return float(time[0]), step * factor, values[::factor]
     # A zero-phase low-pass before decimation keeps fast content from showing up as a slow wave;
     # the odd extension keeps the ends where they are.
-    thinned = resample_poly(values, 1, factor, axis=0, padtype="antireflect")
+    thinned = scipy.signal.resample_poly(values, 1, factor, axis=0, padtype="antireflect")
     return float(time[0]), step * factor, thinned
 
 

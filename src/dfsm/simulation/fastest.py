@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.models.dfsm import DFSM
+from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 
 # Largest h |λ|: half of what is stable, where a mode is still followed and over in a few steps.
@@ -41,18 +41,35 @@ def fastest_rate(model: DFSM, inputs: Array) -> float:
     """
     s = model.signals
     some = inputs[np.unique(np.linspace(0, len(inputs) - 1, _PLACES).astype(int))]
-    if model.e is None and model.terms is None and model.f.schedule is None:
-        A = np.asarray(model.f.coefficients)[:, :, s.state_columns]
+    # In NumPy, but for what the model computes: each operation of JAX would be compiled.
+    at = np.zeros((len(some), len(s.inputs)))
+    at[:, s.order.driving_columns] = some[:, : len(s.driving)]
+    at[:, s.order.columns("parameters")] = some[:, len(s.driving) :]
+    column = model.f.schedule
+    scheduled_by_state = column is not None and column in range(len(s.inputs))[s.state_columns]
+    if model.e is None and model.terms is None and not scheduled_by_state:
+        value = np.zeros(len(some)) if column is None else at[:, column]
+        A = _linear_fits(model.f, value)[:, :, s.state_columns]
     else:
-        u, w, p = s.order.split_exogenous(jnp.asarray(some))
-        at = np.asarray(s.order.join(jnp.zeros((len(some), len(s.states))), u, w, p))
         x = _usual(model.region, at)[:, s.state_columns]
-        A = np.asarray(_state_matrices(model, jnp.asarray(x), u, w, p))
+        u, w, p = (at[:, s.order.columns(g)] for g in ("controls", "disturbances", "parameters"))
+        A = np.asarray(_state_matrices(model, x, u, w, p))
     if not np.isfinite(A).all():
         return 0.0
     values = np.linalg.eigvals(A)
     size = np.abs(values)
     return float(size[values.real < size / 2].max(initial=0.0))
+
+
+def _linear_fits(f: LinearModel, value: Array) -> Array:
+    """L of a linear fit at schedule values ``(place,)``, ``(place, target, input)``."""
+    grid, L = np.asarray(f.grid), np.asarray(f.coefficients)
+    if f.schedule is None:
+        return L
+    value = np.clip(value, grid[0], grid[-1])
+    i = np.clip(np.searchsorted(grid, value, side="right") - 1, 0, len(grid) - 2)
+    t = ((value - grid[i]) / (grid[i + 1] - grid[i]))[:, None, None]
+    return (1 - t) * L[i] + t * L[i + 1]
 
 
 def _usual(region: Region, inputs: Array) -> Array:
@@ -63,9 +80,7 @@ def _usual(region: Region, inputs: Array) -> Array:
 
 
 @eqx.filter_jit
-def _state_matrices(
-    model: DFSM, x: jax.Array, u: jax.Array, w: jax.Array, p: jax.Array
-) -> jax.Array:
+def _state_matrices(model: DFSM, x: Array, u: Array, w: Array, p: Array) -> jax.Array:
     """∂f̂/∂ξ at some places, ``(place, state, state)``."""
     model = model.prepared()
     slope = jax.jacfwd(model.derivative)

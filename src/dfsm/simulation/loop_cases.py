@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
@@ -169,7 +169,7 @@ def _interpolated(run: Trajectory, mesh: Array, kinds: Sequence[Between]) -> Arr
         if kind == "hold":
             inputs[:, i] = values[before]
         elif kind == "cubic":
-            inputs[:, i] = CubicSpline(run.time, values)(mesh)
+            inputs[:, i] = scipy.interpolate.CubicSpline(run.time, values)(mesh)
         else:
             inputs[:, i] = np.interp(mesh, run.time, values)
     return inputs

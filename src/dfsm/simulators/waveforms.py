@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.types import Array
@@ -176,7 +176,7 @@ def interpolated(time: ArrayLike, values: ArrayLike) -> PiecewisePolynomial:
         its error control sees what little the third derivative jumps by.
     """
     time = np.array(time, dtype=np.float64)
-    spline = CubicSpline(time, np.asarray(values, dtype=np.float64))
+    spline = scipy.interpolate.CubicSpline(time, np.asarray(values, dtype=np.float64))
     coefficients = np.moveaxis(spline.c, 0, 1)
     return PiecewisePolynomial(*map(fixed, (time[[0, -1]], np.empty(0), time[:-1], coefficients)))
 

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from scipy.special import roots_jacobi
+import scipy
 
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
@@ -119,7 +119,8 @@ def scheme_of(kind: Kind, degree: int = 3) -> Scheme:
     if kind != "radau":
         raise DfsmError(f"scheme is {kind}, expected trapezoidal, hermite_simpson or radau")
     # Right end included (Radau IIA): zeros of (1 − x) P^(1,0)_{n−1}(x), with an exact quadrature.
-    inner = (roots_jacobi(degree - 1, 1.0, 0.0)[0] + 1) / 2 if degree > 1 else np.empty(0)
+    zeros = scipy.special.roots_jacobi(degree - 1, 1.0, 0.0)[0] if degree > 1 else np.empty(0)
+    inner = (zeros + 1) / 2
     collocated = np.append(inner, 1.0)
     points = np.append(0.0, collocated)
     D = lagrange(points, collocated, derivative=True)

@@ -105,7 +105,7 @@ def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
     mesh = _equidistant(trajectory) if packed else None
     if mesh is None:
         fields.append(pa.field("Time", pa.float64(), metadata={"unit": "s"}))
-        arrays.append(pa.array(trajectory.time))
+        arrays.append(_array(trajectory.time))
     else:
         schema["dfsm.time_start"], schema["dfsm.time_step"] = map(repr, mesh)
     for channel, values in zip(trajectory.channels, trajectory.values.T, strict=True):
@@ -116,11 +116,11 @@ def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
             known["role"] = channel.role
         codes = _pack(values, channel.step) if packed and channel.step else None
         if codes is None:
-            arrays.append(pa.array(np.ascontiguousarray(values)))
+            arrays.append(_array(values))
         else:
             numbers, scale, offset = codes
             known |= {"scale": repr(scale), "offset": repr(offset)}
-            arrays.append(pa.array(numbers, type=pa.int32()))
+            arrays.append(_array(numbers))
             coded[channel.name] = "DELTA_BINARY_PACKED"
         fields.append(pa.field(channel.name, arrays[-1].type, metadata=known))
     table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=schema))
@@ -132,6 +132,24 @@ def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
         options |= {"use_dictionary": False, "column_encoding": coded}
     with write_file(path) as temporary:
         pq.write_table(table, temporary, **options)
+
+
+def _array(values: Array | NDArray[np.int32]) -> pa.Array:
+    """Arrow's array of numbers. ``pyarrow.array`` would import pandas to see what it was given."""
+    import pyarrow as pa
+
+    content = pa.py_buffer(np.ascontiguousarray(values))
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, content])
+
+
+def _floats(column: pa.ChunkedArray) -> Array:
+    """Numbers of a column, NaN where there is none."""
+    import pyarrow as pa
+
+    if column.null_count or pa.types.is_boolean(column.type) or not column.num_chunks:
+        return column.cast(pa.float64(), safe=False).to_numpy()
+    # Both of the above import pandas.
+    return np.concatenate([np.from_dlpack(part).astype(np.float64) for part in column.chunks])
 
 
 def _header_digest(table: pa.Table) -> str:
@@ -242,7 +260,7 @@ def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
         raise DfsmError(
             f"{path}: column '{field.name}' holds {kind}, expected numbers: leave it out"
         )
-    values = table.column(index).cast(pa.float64(), safe=False).to_numpy()
+    values = _floats(table.column(index))
     known = _texts(field.metadata)
     if "scale" not in known:
         return values

@@ -9,7 +9,7 @@ import warnings
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from dfsm.core.types import Array
 
@@ -54,5 +54,7 @@ def _optimum(cost: Any, start: Array, bounds: Array) -> tuple[Array, float]:
     With the usual tolerances it stops where rounding decides, and the units of the data with it.
     """
     tight = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 1000}
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=tight)
+    found = scipy.optimize.minimize(
+        cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=tight
+    )
     return found.x, float(found.fun)

@@ -22,15 +22,19 @@ Beyond the table, where nothing is known, C_T continues
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+import scipy
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.types import Array
 from dfsm.data.readers.rotor_table import RotorTable
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RectBivariateSpline
 
 # Largest difference from the table's own spline, as a share of the largest coefficient at which
 # the rotor takes power.
@@ -140,7 +144,7 @@ def _everywhere(
 ) -> Array:
     """One coefficient times sin²φ / κ² on the whole grid, shape ``(angle, pitch)``."""
     ratio = table.tip_speed_ratio
-    spline = RectBivariateSpline(ratio, table.pitch, values, kx=3, ky=3, s=0)
+    spline = scipy.interpolate.RectBivariateSpline(ratio, table.pitch, values, kx=3, ky=3, s=0)
     low, high = ratio[0], ratio[-1]
     with np.errstate(divide="ignore"):
         at = np.where(angle > 0, stretch / np.tan(angle), np.inf)
@@ -244,7 +248,10 @@ def _error(table: RotorTable, weights: Array, grid: Grid) -> float:
     takes = table.cp > 0
     errors = []
     for mine, values in zip(ours, (table.ct, table.cq), strict=True):
-        exact = RectBivariateSpline(table.tip_speed_ratio, table.pitch, values, s=0)(ratio, pitch)
+        spline = scipy.interpolate.RectBivariateSpline(
+            table.tip_speed_ratio, table.pitch, values, s=0
+        )
+        exact = spline(ratio, pitch)
         errors.append(np.abs(mine - exact).max() / np.abs(values[takes]).max())
     return float(max(errors))
 
