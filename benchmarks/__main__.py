@@ -1,8 +1,8 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-    [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [dymos] [fuzz] [kill]
-    [feedback]
+    [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [dymos] [gpu]
+    [fuzz] [kill] [feedback]
 
 Without names all but `peer` and `dymos`, which make environments of their own and install
 jax-sysid and dymos there, and `fuzz` and `kill`, which damage inputs and end commands for hours
@@ -32,6 +32,7 @@ from benchmarks import (
     feedback,
     field,
     fuzz,
+    gpu,
     kill,
     limits,
     matched,
@@ -63,6 +64,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "exports": exports.run,
     "peer": peer.run,
     "dymos": dymos_peer.run,
+    "gpu": gpu.run,
     "fuzz": fuzz.run,
     "kill": kill.run,
 }

@@ -35,7 +35,7 @@ def run() -> dict[str, Any]:
     """All timings, in s."""
     runs = dfsm.read_all([str(DATA / "iea15_2dof_12mps_s0[1-8].parquet")])
     test = dfsm.read(DATA / "iea15_2dof_12mps_s09.outb")
-    model = _with_units(runs)
+    model = with_units(runs)
     return {
         "linear_fit": linear_fit(),
         "corrective": corrective(runs),
@@ -139,7 +139,7 @@ def _settings() -> dfsm.FitSettings:
     return replace(demo().settings(5), corrective=recipe)
 
 
-def _with_units(runs: list[dfsm.Trajectory]) -> DFSM:
+def with_units(runs: list[dfsm.Trajectory]) -> DFSM:
     """An LPV model with corrective functions of 200 units for every fitted row.
 
     The fit may decide that a row needs none; here all are wanted. Their weights are made so small

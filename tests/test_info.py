@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from dfsm.data import readers
 from dfsm.data.info import describe
-from dfsm.data.readers import read
+from dfsm.data.readers import describe_all, openfast, parquet, read, write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
+from dfsm.errors import DfsmError
+from outb import outb_bytes
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 
@@ -82,7 +87,7 @@ def test_to_dict_is_strict_json():
     assert again["interval"] == "irregular"
     assert again["channels"][0]["mean"] is None
     assert again["channels"][1]["step"] == 0.5
-    run = Trajectory(np.arange(3), np.ones((3, 1)), (Channel("a"),))
+    run = Trajectory(np.arange(3.0), np.ones((3, 1)), (Channel("a"),))
     assert describe(run).to_dict()["interval"] == 1
 
 
@@ -110,3 +115,46 @@ def test_a_sample_far_beyond_all_others_is_told():
     run = Trajectory(np.arange(100.0), values[:, None], (Channel("x"),))
     (warning,) = describe(run).warnings
     assert warning.startswith("'x' is 1e+160 at 70 s, far beyond")
+
+
+def test_long_files_are_described_channel_by_channel_as_whole_ones(tmp_path, monkeypatch):
+    rng = np.random.default_rng(1)
+    time = np.arange(400) * 0.05
+    values = np.cumsum(rng.normal(size=(400, 3)), axis=0) + np.sin(time)[:, None]
+    values[0, 1] += 100
+    channels = tuple(Channel(*c) for c in zip("abc", ("m", "deg", "kN"), strict=True))
+    run = Trajectory(time, values, channels, name="long", wall_time=3.0, notes=("told",))
+    write_table(run, tmp_path / "a.parquet")
+    run.to_pandas().reset_index().to_parquet(tmp_path / "b.parquet", row_group_size=150)
+    with_nan = values.copy()
+    with_nan[7, 2] = np.nan
+    write_table(replace(run, values=with_nan), tmp_path / "c.parquet")
+    for n in (1, 2, 3, 4):
+        content = outb_bytes(time, values, ["a", "b", "c"], ["m", "deg", "kN"], format_id=n)
+        (tmp_path / f"{n}.outb").write_bytes(content + b"left")
+    # The same row again and again at the end was not recorded: that is for the reader of all.
+    frozen = np.concatenate([values[:380], np.zeros((20, 3))])
+    write_table(replace(run, values=frozen), tmp_path / "frozen.parquet")
+    expected = [json.dumps(i.to_dict()) for i in describe_all([tmp_path / "*.*"])]
+    monkeypatch.setattr(parquet, "LONG", 0)
+    monkeypatch.setattr(openfast, "LONG", 0)
+    whole, read_whole = [], readers.read
+    monkeypatch.setattr(readers, "read", lambda *a: whole.append(a[0].name) or read_whole(*a))
+    found = [json.dumps(i.to_dict()) for i in describe_all([tmp_path / "*.*"])]
+    assert found == expected
+    assert whole == ["frozen.parquet"]
+    packed = EXAMPLES / "iea15_2dof_06mps_s01.parquet"
+    assert describe_all([packed]) == [describe(read_whole(packed))]
+    assert whole == ["frozen.parquet"]
+
+
+def test_a_long_file_with_a_damaged_page_costs_a_sentence(tmp_path, monkeypatch):
+    values = np.random.default_rng(2).normal(size=(400, 1))
+    path = tmp_path / "a.parquet"
+    write_table(Trajectory(np.arange(400.0), values, (Channel("x"),)), path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 255
+    path.write_bytes(content)
+    monkeypatch.setattr(parquet, "LONG", 0)
+    with pytest.raises(DfsmError, match="no readable Parquet file"):
+        describe_all([path])

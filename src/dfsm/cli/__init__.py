@@ -85,11 +85,10 @@ def info(
 ) -> None:
     """List channels, units, ranges, sampling and quantisation, and what looks wrong."""
     from dfsm.cli.tables import print_info, print_merged
-    from dfsm.data.info import describe
-    from dfsm.data.readers import read_all
+    from dfsm.data.readers import describe_all
 
     with show_progress():
-        infos = [describe(run) for run in read_all(files, step=step)]
+        infos = describe_all(files, step=step)
     if as_json:
         print_json([i.to_dict() for i in infos])
     elif each or len(infos) == 1:

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from dfsm.data.suspects import stray_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
+
+if TYPE_CHECKING:
+    from dfsm.data.readers.long_run import LongRun
 
 # What differs from run to run in sentences that say the same: lists of channels, and numbers.
 _CHANNELS = re.compile(r"\bin '[^']*'(?:, '[^']*')*(?: and \d+ more channels)?")
@@ -95,13 +98,14 @@ class RunInfo:
         return plain
 
 
-def describe(trajectory: Trajectory) -> RunInfo:
+def describe(trajectory: Trajectory | LongRun) -> RunInfo:
     """Describe a run: sampling, range of every channel, and what deserves a warning.
 
     Parameters
     ----------
     trajectory
-        Any run; NaN and infinite samples are counted and left out of the statistics.
+        Any run; NaN and infinite samples are counted and left out of the statistics. One channel
+        is looked at after the other.
 
     Returns
     -------
@@ -112,30 +116,42 @@ def describe(trajectory: Trajectory) -> RunInfo:
         return _described(trajectory)
 
 
-def _described(trajectory: Trajectory) -> RunInfo:
-    steps = np.diff(trajectory.time)
+def _described(run: Trajectory | LongRun) -> RunInfo:
+    steps = np.diff(run.time)
+    shortest, longest = float(steps.min()), float(steps.max())
+    del steps
+    channels, sentences = list[ChannelInfo](), list[str]()
+    jumping, ends = list[str](), dict[str, float]()
+    seen: dict[bytes, str] = {}
+    for channel in run.channels:
+        name, values = channel.name, run[channel.name]
+        channels.append(_channel_info(channel, values, run))
+        if jumps_at_first(values):
+            jumping.append(name)
+        if (end := transient_end(run.time, values)) is not None:
+            ends[name] = end
+        sentences += _warnings(channel, values, run.time, seen)
+    sentences += stuck_notes(run)
+    gap = gap_warning(run)
     return RunInfo(
-        name=trajectory.name,
-        source=trajectory.source,
-        samples=len(trajectory),
-        start=float(trajectory.time[0]),
-        stop=float(trajectory.time[-1]),
-        interval=trajectory.time_step,
-        min_interval=float(steps.min()),
-        max_interval=float(steps.max()),
-        wall_time=trajectory.wall_time,
-        channels=tuple(
-            _channel_info(c, v, trajectory.time)
-            for c, v in zip(trajectory.channels, trajectory.values.T, strict=True)
-        ),
-        warnings=tuple(_warnings(trajectory)),
+        name=run.name,
+        source=run.source,
+        samples=len(run),
+        start=float(run.time[0]),
+        stop=float(run.time[-1]),
+        interval=run.time_step,
+        min_interval=shortest,
+        max_interval=longest,
+        wall_time=run.wall_time,
+        channels=tuple(channels),
+        warnings=(*([gap] if gap else []), *_starts(jumping, ends), *sentences, *run.notes),
     )
 
 
-def _channel_info(channel: Channel, values: Array, time: Array) -> ChannelInfo:
-    finite = np.isfinite(values)
+def _channel_info(channel: Channel, values: Array, run: Trajectory | LongRun) -> ChannelInfo:
+    finite, time = np.isfinite(values), run.time
     # On an equidistant mesh a sample stands for a step, whatever is missing beside it.
-    apart = len(time) > 1 and weights_over_time([time]) is not None
+    apart = run.time_step is None
     if len(values) > _BLOCK and finite.all() and not apart:
         return _long_channel_info(channel, values)
     good = values[finite]
@@ -171,7 +187,7 @@ def _parts(values: Array) -> Iterator[Array]:
 _GAP = 20.0
 
 
-def gap_warning(trajectory: Trajectory) -> str | None:
+def gap_warning(trajectory: Trajectory | LongRun) -> str | None:
     """Say where the time mesh has its longest hole, if it has one.
 
     Parameters
@@ -186,6 +202,8 @@ def gap_warning(trajectory: Trajectory) -> str | None:
     """
     steps = np.diff(trajectory.time)
     gap = int(np.argmax(steps))
+    if steps[gap] <= _GAP * steps.min():
+        return None
     others = np.sort(np.delete(steps, gap))
     if not len(others):
         return None
@@ -200,53 +218,45 @@ def gap_warning(trajectory: Trajectory) -> str | None:
     )
 
 
-def _warnings(trajectory: Trajectory) -> list[str]:
+def _warnings(channel: Channel, values: Array, time: Array, seen: dict[bytes, str]) -> list[str]:
+    """What deserves a warning about one channel; `seen` are the digests of those before it."""
+    name, bad = channel.name, np.flatnonzero(~np.isfinite(values))
     sentences = []
-    if gap := gap_warning(trajectory):
-        sentences.append(gap)
-    sentences += _starts(trajectory)
-    seen: dict[bytes, str] = {}
-    for name, values in zip(trajectory.names, trajectory.values.T, strict=True):
-        bad = np.flatnonzero(~np.isfinite(values))
-        if slower := slower_warning(trajectory, name):
-            sentences.append(slower)
-        elif len(bad):
-            sentences.append(
-                f"'{name}' has {len(bad)} NaN or infinite samples, the first at "
-                f"{trajectory.time[bad[0]]:g} s"
-            )
-        elif values.min() == values.max():
-            # Two constants often agree by chance: that they are constant says enough.
-            sentences.append(f"'{name}' is constant ({values[0]:g})")
-            continue
-        h = hashlib.sha256()
-        for part in _parts(values):
-            h.update(part.data)
-        data = h.digest()
-        if data in seen:
-            sentences.append(f"'{name}' holds the same data as '{seen[data]}'")
-        else:
-            seen[data] = name
-            sentences += _looks(trajectory, name)
-    return [*sentences, *stuck_notes(trajectory), *trajectory.notes]
+    if slower := slower_warning(time, values, name):
+        sentences.append(slower)
+    elif len(bad):
+        sentences.append(
+            f"'{name}' has {len(bad)} NaN or infinite samples, the first at {time[bad[0]]:g} s"
+        )
+    elif values.min() == values.max():
+        # Two constants often agree by chance: that they are constant says enough.
+        return [f"'{name}' is constant ({values[0]:g})"]
+    h = hashlib.sha256()
+    for part in _parts(values):
+        h.update(part.data)
+    data = h.digest()
+    if data in seen:
+        return [*sentences, f"'{name}' holds the same data as '{seen[data]}'"]
+    seen[data] = name
+    return [*sentences, *_looks(channel, values, time)]
 
 
-def _looks(run: Trajectory, name: str) -> list[str]:
+def _looks(channel: Channel, values: Array, time: Array) -> list[str]:
     """What a channel is, from its name and its samples."""
-    sentences, unit = [], run.channel(name).unit
-    if len(strays := stray_rows(run[name])):
+    sentences, name, unit = [], channel.name, channel.unit
+    if len(strays := stray_rows(values)):
         first = strays[0]
         more = f" (and {len(strays) - 1} more)" if len(strays) > 1 else ""
         sentences.append(
-            f"'{name}' is {run[name][first]:.4g} at {run.time[first]:g} s{more}, far beyond all "
+            f"'{name}' is {values[first]:.4g} at {time[first]:g} s{more}, far beyond all "
             "its other samples: correct it, or set data.outliers to drop"
         )
-    if wrap := wrapping(run.time, run[name], unit):
+    if wrap := wrapping(time, values, unit):
         sentences.append(
             f"'{name}' wraps at {wrap.period:.4g}{f' {unit}' if unit else ''}, {wrap.times} times, "
             f"first at {wrap.first:g} s: as a state it must go on (numpy.unwrap)"
         )
-    if interval := held_interval(run.time, run[name]):
+    if interval := held_interval(time, values):
         sentences.append(
             f"'{name}' changes every {interval:g} s only and stays as it was in between: a slower "
             "record, or a held command"
@@ -256,16 +266,14 @@ def _looks(run: Trajectory, name: str) -> list[str]:
     return sentences
 
 
-def _starts(run: Trajectory) -> list[str]:
-    """What is wrong with the beginning of a run."""
+def _starts(jumping: Sequence[str], ends: Mapping[str, float]) -> list[str]:
+    """What is wrong with the beginning of a run, in the channels concerned."""
     sentences = []
-    jumping = [n for n in run.names if jumps_at_first(run[n])]
     if jumping:
         sentences.append(
             f"the first sample has nothing to do with the next in {_some(jumping)}: leave it out "
             "with data.start"
         )
-    ends = {n: t for n in run.names if (t := transient_end(run.time, run[n])) is not None}
     if ends:
         sentences.append(
             f"a transient, until {max(ends.values()):.4g} s in {_some(list(ends))}, is far from "

@@ -82,16 +82,16 @@ def moments(values: Array) -> NDArray[np.bool_]:
 
 
 def _changes(values: Array) -> IntArray:
-    return np.flatnonzero(np.diff(values) != 0)
+    return np.flatnonzero(values[1:] != values[:-1])
 
 
 def _held(values: Array) -> int | None:
     """Samples from one change to the next; None where these are not regular."""
     if len(values) < _FEWEST or not np.isfinite(values).all():
         return None
-    changes = _changes(values)
-    if len(changes) < _CHANGES or len(changes) > 0.6 * len(values):
+    if not _CHANGES <= np.count_nonzero(values[1:] != values[:-1]) <= 0.6 * len(values):
         return None
+    changes = _changes(values)
     apart = np.diff(changes)
     usual = int(np.median(apart))
     # A value that happens to be the same twice makes a gap of twice the length.
@@ -104,8 +104,12 @@ def jumps_at_first(values: Array) -> bool:
     """Whether the first sample has nothing to do with those that follow."""
     if len(values) < _FEWEST or not np.isfinite(values).all():
         return False
+    begin = np.abs(np.diff(values[: _FEWEST + 1]))
+    near = begin[1:_FEWEST].max()
+    if begin[0] <= _JUMP * near:  # as nearly always, and the rest need not be looked at
+        return False
     steps = np.abs(np.diff(values))
-    usual, near = np.sqrt(np.mean(steps[1:] ** 2)), steps[1:_FEWEST].max()
+    usual = np.sqrt(np.mean(steps[1:] ** 2))
     return bool(usual > 0 and steps[0] > _JUMP * max(near, 0.1 * usual) and steps[0] > 2 * usual)
 
 
@@ -115,8 +119,11 @@ def transient_end(time: Array, values: Array) -> float | None:
     if tenth < _FEWEST or not np.isfinite(values).all():
         return None
     later = values[half:]
-    far = np.abs(values - later.mean()) > _FAR * later.std()
-    if not later.std() > 0 or not far[:tenth].any() or far[half:].any():
+    middle, spread = later.mean(), later.std()
+    if not spread > 0 or not (np.abs(values[:tenth] - middle) > _FAR * spread).any():
+        return None
+    far = np.abs(values - middle) > _FAR * spread
+    if far[half:].any():
         return None
     # What is far later on is no part of the start.
     return float(time[np.flatnonzero(far[: 2 * tenth])[-1]])

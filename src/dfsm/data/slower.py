@@ -86,15 +86,15 @@ def _filled(time: Array, mesh: Array, samples: Array, way: Way) -> Array:
     return samples[np.maximum(np.searchsorted(mesh, time, side="right") - 1, 0)]
 
 
-def slower_warning(run: Trajectory, name: str) -> str | None:
-    """Say that a channel has fewer samples than its table, if it has.
+def slower_warning(time: Array, values: Array, name: str) -> str | None:
+    """Say that a channel has fewer samples ``(time,)`` than its table, if it has.
 
     Returns
     -------
     str | None
         One sentence that does not name the run; None where its gaps are of another kind.
     """
-    interval = own_interval(run.time, np.isfinite(run[name]))
+    interval = own_interval(time, np.isfinite(values))
     if interval is None:
         return None
     return (

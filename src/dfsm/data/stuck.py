@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from dfsm.data.readers.long_run import LongRun
 
 # Fewest intervals without a change, and their number relative to the longest that is usual.
 _FEWEST, _LONGER = 8, 3
@@ -55,7 +59,7 @@ class Stuck:
         )
 
 
-def stuck_in(run: Trajectory, names: Iterable[str] | None = None) -> list[Stuck]:
+def stuck_in(run: Trajectory | LongRun, names: Iterable[str] | None = None) -> list[Stuck]:
     """Find where channels stand still in the middle of a run, in the order of time.
 
     Parameters
@@ -67,6 +71,8 @@ def stuck_in(run: Trajectory, names: Iterable[str] | None = None) -> list[Stuck]
     """
     looked = list(run.names if names is None else names)
     spans = {span for name in looked for span in stuck_spans(run[name])}
+    if not spans:
+        return []
     moving = [n for n in looked if np.mean(np.diff(run[n]) != 0) >= 1 - _STAYS]
     found = []
     for first, last in sorted(spans):
@@ -77,17 +83,24 @@ def stuck_in(run: Trajectory, names: Iterable[str] | None = None) -> list[Stuck]
     return found
 
 
-def stuck_notes(run: Trajectory, names: Sequence[str] | None = None) -> list[str]:
+def stuck_notes(run: Trajectory | LongRun, names: Sequence[str] | None = None) -> list[str]:
     """The same in sentences."""
-    looked = run.names if names is None else names
+    looked, found = run.names if names is None else names, stuck_in(run, names)
+    if not found:
+        return []
     varying = sum(bool(np.ptp(run[n]) > 0) for n in looked)
     several = varying > 2
-    return [s.told(several and len(s.names) >= _ALMOST_ALL * varying) for s in stuck_in(run, names)]
+    return [s.told(several and len(s.names) >= _ALMOST_ALL * varying) for s in found]
 
 
 def stuck_spans(values: Array) -> list[tuple[int, int]]:
     """First and last sample of every span in which samples ``(time,)`` stand still."""
     if not np.isfinite(values).all():
+        return []
+    still = values[1:] == values[:-1]
+    for apart in (1, 2, 4):  # as long as _FEWEST: most records have no such span at all
+        still = still[:-apart] & still[apart:]
+    if not still.any():
         return []
     steps = np.diff(values)
     moves = np.abs(steps[steps != 0])

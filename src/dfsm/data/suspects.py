@@ -6,11 +6,12 @@ coefficient, and a square of 1e160 is no number any more.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
 from dfsm.core.units import agree
@@ -25,6 +26,8 @@ SUSPECTS: tuple[str, ...] = get_args(Suspects)
 _HUGE = 1e100
 # A few samples are strays where they are so many times further from the median than all others.
 _STRAY, _FEW = 1e3, 5
+# Samples that are looked at together.
+_BLOCK = 1_000_000
 # Factors between units that bear one name in files: thousands, rad and deg, rad/s and rpm.
 _FACTORS = {
     1000.0: "a thousand",
@@ -125,21 +128,44 @@ def _without_strays(
 def stray_rows(samples: Array) -> IntArray:
     """Rows of the samples that are huge, or a few that are far from all others."""
     finite = np.isfinite(samples)
-    huge = np.flatnonzero(finite & (np.abs(np.where(finite, samples, 0.0)) > _HUGE))
+    huge = _rows(samples, lambda part: np.isfinite(part) & (np.abs(part) > _HUGE))
     if len(huge) or len(samples) <= 2 * _FEW:
         return huge
-    good = samples[finite]
+    good = samples if finite.all() else samples[finite]
     if len(good) <= 2 * _FEW:
         return huge
     middle = float(np.median(good))
-    off = np.where(finite, np.abs(np.where(finite, samples, middle) - middle), 0.0)
-    order = np.argpartition(-off, _FEW)[: _FEW + 1]
-    order = order[np.argsort(-off[order], kind="stable")]
-    far = off[order]
+    # The farthest of each block, and of these the farthest.
+    found = [_farthest(samples[k : k + _BLOCK], middle) for k in range(0, len(samples), _BLOCK)]
+    order = np.concatenate([k * _BLOCK + rows for k, rows in enumerate(found)])
+    off = _off(samples[order], middle)
+    first = np.argsort(-off, kind="stable")[: _FEW + 1]
+    order, far = order[first], off[first]
     for count in range(1, _FEW + 1):
         if far[count] > 0 and far[count - 1] > _STRAY * far[count]:
             return np.sort(order[:count])
     return huge
+
+
+def _off(samples: Array, middle: float) -> Array:
+    """Distances from the middle, 0 of what is no number."""
+    finite = np.isfinite(samples)
+    return np.where(finite, np.abs(np.where(finite, samples, middle) - middle), 0.0)
+
+
+def _farthest(samples: Array, middle: float) -> IntArray:
+    """The few rows that are farthest from the middle, in their order."""
+    off = _off(samples, middle)
+    if len(off) <= _FEW + 1:
+        return np.arange(len(off))
+    return np.sort(np.argpartition(-off, _FEW)[: _FEW + 1])
+
+
+def _rows(samples: Array, which: Callable[[Array], NDArray[np.bool_]]) -> IntArray:
+    """Rows of which something is true, looked at block by block."""
+    blocks = range(0, len(samples), _BLOCK)
+    parts = [k + np.flatnonzero(which(samples[k : k + _BLOCK])) for k in blocks]
+    return np.concatenate([np.empty(0, dtype=np.int64), *parts])
 
 
 def _other_unit(runs: Sequence[Trajectory], name: str) -> tuple[int, float, str] | None:

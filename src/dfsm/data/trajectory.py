@@ -11,8 +11,8 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -181,11 +181,10 @@ class Trajectory(Drawn):
     def select(self, names: Iterable[str]) -> Trajectory:
         """Keep the named channels, in this order."""
         columns = self.columns(names)
-        return replace(
-            self,
-            values=self.values[:, columns],
-            channels=tuple(self.channels[i] for i in columns),
-        )
+        channels = tuple(self.channels[i] for i in columns)
+        # The constructor tells a name that is twice among them.
+        make = self._part if len(set(columns)) == len(columns) else partial(replace, self)
+        return make(values=self.values[:, columns], channels=channels)
 
     def window(self, start: float | None = None, stop: float | None = None) -> Trajectory:
         """Keep ``start <= time <= stop``; the recorded wall time shrinks in proportion.
@@ -205,21 +204,26 @@ class Trajectory(Drawn):
         hi = np.inf if stop is None else stop + slack
         if start is not None and stop is not None and start >= stop:
             raise DfsmError(f"the time window goes from {start:g} s to {stop:g} s: swap the two")
-        keep = (self.time >= lo) & (self.time <= hi)
-        if keep.sum() < 2:
+        if (keep := (self.time >= lo) & (self.time <= hi)).sum() < 2:
             raise DfsmError(
                 f"{self.where}: runs from {self.time[0]:g} s to {self.time[-1]:g} s, shorter than "
                 f"the time window asked for ({start if start is not None else '…'} to "
                 f"{stop if stop is not None else '…'} s): change the window or leave the run out"
             )
-        time = self.time[keep]
-        part = float(time[-1] - time[0]) / self.duration
-        return replace(
-            self,
-            time=time,
-            values=self.values[keep],
-            wall_time=None if self.wall_time is None else self.wall_time * part,
-        )
+        time, wall = self.time[keep], self.wall_time
+        if wall is not None:
+            wall = wall * (float(time[-1] - time[0]) / self.duration)
+        return self._part(time=time, values=self.values[keep], wall_time=wall)
+
+    def _part(self, **changes: Any) -> Trajectory:
+        """Replace fields by parts of what is here, neither copied nor checked once more."""
+        part: Trajectory = object.__new__(type(self))
+        for f in dataclasses.fields(self):
+            value = changes.get(f.name, getattr(self, f.name))
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(part, f.name, value)
+        return part
 
     def with_channels(
         self,

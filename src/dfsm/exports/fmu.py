@@ -26,7 +26,7 @@ from dfsm.exports.c_code import CSource, to_c
 from dfsm.exports.fmu_description import Variable, build_description, model_description
 from dfsm.exports.identifiers import numbers
 from dfsm.models.dfsm import DFSM
-from dfsm.simulation.fastest import REACH, fastest_rate
+from dfsm.simulation.fastest import REACH, fastest_rates
 
 Kind = Literal["model-exchange", "co-simulation"]
 KINDS: tuple[Kind, ...] = ("model-exchange", "co-simulation")
@@ -123,7 +123,7 @@ def write_fmu(
 def _safe_step(model: DFSM) -> float:
     s, middle = model.signals, np.asarray(model.region.mean)[None]
     columns = [s.order.column(name) for name in s.exogenous]
-    rate = fastest_rate(model, middle[:, columns])
+    (rate,) = fastest_rates(model, [middle[:, columns]])
     return float(min(_LONGEST, 0.5 * REACH / rate)) if rate > 0 else _LONGEST
 
 

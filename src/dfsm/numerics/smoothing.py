@@ -38,6 +38,7 @@ _STEPS = 8  # values of λ tried per level
 # Products of so many numbers BLAS shares among threads, which wait for one another many times
 # longer than they work.
 _THREADED = 10_000
+_KEPT = 20_000  # size of equations up to which their factors are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +228,7 @@ def _choose(mesh: _Mesh, z: Array, variance: float | None) -> _Chosen | None:
     free: list[float] = []  # log of N - tr H
     ends: list[float] = []  # largest residual in the margins
     for level, lam in mesh.path():
-        everywhere = level.fit(z, lam)[1]
+        everywhere = level.fit(z, lam, keep=True)[1]
         residual = everywhere[inner]
         dof = n - level.degrees_of_freedom(lam)
         if dof < 1e-5 * n:  # as good as interpolation, and lost in rounding
@@ -285,15 +286,20 @@ class _Level:
         self.gram = _banded_gram(rows, start, self.size)
         self.penalty = _banded_gram(*_third_derivatives(self.knots), self.size)
         self._degrees_of_freedom: dict[float, float] = {}
+        self._factors: dict[float, Array] = {}
 
     def _factor(self, lam: float) -> Array:
         matrix = self.gram + lam * self.penalty
         return scipy.linalg.cholesky_banded(matrix, overwrite_ab=True, check_finite=False)
 
-    def fit(self, z: Array, lam: float) -> tuple[Array, Array]:
-        """Coefficients and residual for one λ."""
-        factor = (self._factor(lam), False)
-        c = scipy.linalg.cho_solve_banded(factor, self.transposed @ z, check_finite=False)
+    def fit(self, z: Array, lam: float, *, keep: bool = False) -> tuple[Array, Array]:
+        """Coefficients and residual for one λ; `keep` the factors for other data on this mesh."""
+        factor = self._factors.get(lam)
+        if factor is None:
+            factor = self._factor(lam)
+            if keep and self.size <= _KEPT:
+                self._factors[lam] = factor
+        c = scipy.linalg.cho_solve_banded((factor, False), self.transposed @ z, check_finite=False)
         return c, z - self.basis @ c
 
     def degrees_of_freedom(self, lam: float) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ _MOST_DECIMALS = 8
 _FEWEST = 4
 # Share of the usual step below which two samples are one instant.
 _INSTANT = 1e-6
+# Samples of a mesh that are looked at together.
+_BLOCK = 1_000_000
 
 
 def time_step(time: Series) -> float | None:
@@ -39,10 +42,14 @@ def time_step(time: Series) -> float | None:
     """
     last = len(time) - 1
     step = float((time[-1] - time[0]) / last)
-    # Not as time[0] + step * index: the error of a step would grow with the index.
-    line = time[0] + (time[-1] - time[0]) * (np.arange(last + 1) / last)
-    error = float(np.abs(time - line).max())
-    slack = 4 * float(np.spacing(np.abs(time).max()))
+
+    def off(first: int, stop: int) -> Series:
+        # Not as time[0] + step * index: the error of a step would grow with the index.
+        line = time[0] + (time[-1] - time[0]) * (np.arange(first, stop) / last)
+        return np.abs(time[first:stop] - line)
+
+    error = _largest(off, len(time))
+    slack = 4 * float(np.spacing(max(abs(time.min()), abs(time.max()))))
     if error <= max(_SHARE * step, slack):
         return step
     # Both ends and the time between may each be half a unit off.
@@ -97,10 +104,18 @@ def own_interval(time: Series, present: NDArray[np.bool_]) -> float | None:
         In s; None where no sample is missing between the first and the last, where they are not
         equidistant, or fewer than four.
     """
+    if present.all():
+        return None
     rows = np.flatnonzero(present)
     if len(rows) < _FEWEST or len(rows) == rows[-1] - rows[0] + 1:
         return None
     return time_step(time[rows])
+
+
+def _largest(parts: Callable[[int, int], Series], count: int) -> float:
+    """Largest of `count` numbers that are computed block by block, as a long mesh needs it."""
+    ends = [*range(0, count, _BLOCK), count]
+    return float(np.max([parts(first, stop).max() for first, stop in pairwise(ends)]))
 
 
 def _single_spacing(largest: float) -> float:
@@ -119,7 +134,13 @@ def _rounding(time: Series, step: float) -> float:
     slack = 4 * np.spacing(largest)
     for decimals in range(_MOST_DECIMALS + 1):
         unit = 10.0**-decimals
-        if unit <= most and np.abs(np.round(time, decimals) - time).max() <= slack:
+        if unit > most:
+            continue
+
+        def off(first: int, stop: int, decimals: int = decimals) -> Series:
+            return np.abs(np.round(time[first:stop], decimals) - time[first:stop])
+
+        if _largest(off, len(time)) <= slack:
             # Whole multiples of the unit would not have been rounded.
             return 0.0 if round((time[-1] - time[0]) / unit) % (len(time) - 1) == 0 else unit
     return 0.0

@@ -6,6 +6,8 @@ grow whatever the model does. A model that is fine may thus be called unstable f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -19,10 +21,12 @@ from dfsm.models.region import Region
 REACH = 1.5
 # Samples of the inputs of a run at which a model is looked at.
 _PLACES = 16
+# Places that are looked at together: numbers that are compiled for.
+_AT_ONCE = (16, 128, 1024)
 
 
-def fastest_rate(model: DFSM, inputs: Array) -> float:
-    """Largest absolute eigenvalue of ∂f̂/∂ξ along a run, in 1/s, but for modes that grow.
+def fastest_rates(model: DFSM, runs: Sequence[Array]) -> list[float]:
+    """Largest absolute eigenvalue of ∂f̂/∂ξ along each run, in 1/s, but for modes that grow.
 
     What grows as fast as it moves leaves the data whatever the step is.
 
@@ -30,30 +34,22 @@ def fastest_rate(model: DFSM, inputs: Array) -> float:
     ----------
     model
         The whole model, with its correction.
-    inputs
-        Controls, disturbances and parameters along the run, ``(time, exogenous)``. The states are
+    runs
+        Controls, disturbances and parameters along each, ``(time, exogenous)``. The states are
         not known before the rollout: those that are usual under the same schedule stand for them.
 
     Returns
     -------
-    float
+    list of float
         0 where nothing is to be said.
     """
-    s = model.signals
-    some = inputs[np.unique(np.linspace(0, len(inputs) - 1, _PLACES).astype(int))]
-    # In NumPy, but for what the model computes: each operation of JAX would be compiled.
-    at = np.zeros((len(some), len(s.inputs)))
-    at[:, s.order.driving_columns] = some[:, : len(s.driving)]
-    at[:, s.order.columns("parameters")] = some[:, len(s.driving) :]
-    column = model.f.schedule
-    scheduled_by_state = column is not None and column in range(len(s.inputs))[s.state_columns]
-    if model.e is None and model.terms is None and not scheduled_by_state:
-        value = np.zeros(len(some)) if column is None else at[:, column]
-        A = _linear_fits(model.f, value)[:, :, s.state_columns]
-    else:
-        x = _usual(model.region, at)[:, s.state_columns]
-        u, w, p = (at[:, s.order.columns(g)] for g in ("controls", "disturbances", "parameters"))
-        A = np.asarray(_state_matrices(model, x, u, w, p))
+    some = [v[np.unique(np.linspace(0, len(v) - 1, _PLACES).astype(int))] for v in runs]
+    ends = np.cumsum([len(v) for v in some])[:-1]
+    return [_fastest(A) for A in np.split(_matrices(model, np.concatenate(some)), ends)]
+
+
+def _fastest(A: Array) -> float:
+    """Of matrices ``(place, state, state)``."""
     if not np.isfinite(A).all():
         return 0.0
     values = np.linalg.eigvals(A)
@@ -61,11 +57,34 @@ def fastest_rate(model: DFSM, inputs: Array) -> float:
     return float(size[values.real < size / 2].max(initial=0.0))
 
 
+def _matrices(model: DFSM, inputs: Array) -> Array:
+    """∂f̂/∂ξ at exogenous inputs ``(place, exogenous)``, ``(place, state, state)``."""
+    s = model.signals
+    # In NumPy, but for what the model computes: each operation of JAX would be compiled.
+    at = np.zeros((len(inputs), len(s.inputs)))
+    at[:, s.order.driving_columns] = inputs[:, : len(s.driving)]
+    at[:, s.order.columns("parameters")] = inputs[:, len(s.driving) :]
+    column = model.f.schedule
+    scheduled_by_state = column is not None and column in range(len(s.inputs))[s.state_columns]
+    if model.e is None and model.terms is None and not scheduled_by_state:
+        value = np.zeros(len(inputs)) if column is None else at[:, column]
+        return _linear_fits(model.f, value)[:, :, s.state_columns]
+    parts = []
+    while len(at):
+        size = next((n for n in _AT_ONCE if n >= len(at)), _AT_ONCE[-1])
+        now, at = at[:size], at[size:]
+        wide = np.concatenate([now, np.repeat(now[-1:], size - len(now), axis=0)])
+        x = _usual(model.region, wide)[:, s.state_columns]
+        u, w, p = (wide[:, s.order.columns(g)] for g in ("controls", "disturbances", "parameters"))
+        parts.append(np.asarray(_state_matrices(model, x, u, w, p))[: len(now)])
+    return np.concatenate(parts)
+
+
 def _linear_fits(f: LinearModel, value: Array) -> Array:
     """L of a linear fit at schedule values ``(place,)``, ``(place, target, input)``."""
     grid, L = np.asarray(f.grid), np.asarray(f.coefficients)
     if f.schedule is None:
-        return L
+        return np.broadcast_to(L, (len(value), *L.shape[1:]))
     value = np.clip(value, grid[0], grid[-1])
     i = np.clip(np.searchsorted(grid, value, side="right") - 1, 0, len(grid) - 2)
     t = ((value - grid[i]) / (grid[i + 1] - grid[i]))[:, None, None]

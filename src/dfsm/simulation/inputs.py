@@ -1,4 +1,4 @@
-"""Inputs of a rollout at any time: pieces of polynomials, and values at parts of the intervals."""
+"""Inputs of a rollout at any time, as pieces of polynomials."""
 
 from __future__ import annotations
 
@@ -75,24 +75,3 @@ def each(driven: Trajectory, between: Between | Sequence[Between]) -> tuple[Betw
     if isinstance(between, str):
         return (between,) * len(driven.channels)
     return tuple(between)
-
-
-def interpolated(driven: Trajectory, kinds: Sequence[Between], parts: Array) -> Array:
-    """Inputs at fractions of every interval between samples, and at the last sample."""
-    inputs = at_parts(driven.values, parts)
-    others = [i for i, kind in enumerate(kinds) if kind != "linear"]
-    if others:
-        values, time = driven.values[:, others], driven.time
-        d, c, b, a = polynomials(time, values, [kinds[i] for i in others])[:, :, None]
-        t = (np.diff(time)[:, None] * parts)[..., None]
-        inputs[:-1, others] = (a + t * (b + t * (c + t * d))).reshape(-1, len(others))
-    return inputs
-
-
-def at_parts(values: Array, parts: Array) -> Array:
-    """Values at fractions of every interval between rows, and the last row."""
-    steps = np.diff(values, axis=0)[:, None, :] * parts[:, None]
-    inner = values[:-1, None, :] + steps
-    return np.concatenate(
-        [inner.reshape(inner.shape[0] * len(parts), values.shape[1]), values[-1:]]
-    )

@@ -1,10 +1,8 @@
-"""The integrators behind `simulate`: a batched RK4 scan, and diffrax's adaptive solvers."""
+"""What the integrators behind `simulate` share, RK4 that JAX can follow, and adaptive steps."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
@@ -16,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array
-from dfsm.data.between import Between
+from dfsm.data.between import Between, polynomials
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.runge_kutta import rk4_step
-from dfsm.simulation.inputs import Pieces, at_parts, each, interpolated, pieces_of
+from dfsm.simulation.inputs import Pieces, each, pieces_of
 
 __all__ = [
     "Case",
@@ -30,47 +28,59 @@ __all__ = [
     "Pieces",
     "Rollout",
     "adapt",
-    "at_steps",
-    "march",
     "mesh_of",
     "pieces_of",
     "rk4",
     "stages",
+    "stepped",
 ]
 
-# Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
+# Bends are padded to a multiple of this, so that runs with as many or a few more share a
+# compilation.
 _PAD = 1000
 _MAX_STEPS = 1_000_000
-# Fixed steps of one run, whose inputs and states are all held in memory.
+# Fixed steps of one run.
 _MOST_STEPS = 10_000_000
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Times to integrate over and the inputs there.
+    """Samples of a run to march along and the inputs there.
 
     Attributes
     ----------
     time
-        Ends and middles of all steps in s, shape ``(2 step + 1,)``.
-    inputs
-        Controls, disturbances and parameters at those times, ``(2 step + 1, exogenous)``.
+        Samples in s, ``(sample,)``.
+    values
+        Controls, disturbances and parameters there, ``(sample, exogenous)``.
+    kinds
+        What each of them does between samples.
     every
-        Steps per sample of the run.
-    held
-        Which inputs are the same throughout each step, as in its middle, ``(exogenous,)``; None
-        where none is.
+        Steps per interval between samples.
     """
 
     time: Array
-    inputs: Array
+    values: Array
+    kinds: tuple[Between, ...]
     every: int
-    held: NDArray[np.bool_] | None = None
 
     @property
     def steps(self) -> int:
         """Number of steps."""
-        return len(self.time) // 2
+        return self.every * (len(self.time) - 1)
+
+    @property
+    def splines(self) -> tuple[int, ...]:
+        """Which inputs are splines."""
+        return tuple(i for i, kind in enumerate(self.kinds) if kind == "cubic")
+
+    def bends(self) -> Array:
+        """Their coefficients of the powers three to one of the time since the sample before.
+
+        Shape ``(3, sample - 1, spline)``.
+        """
+        values = self.values[:, list(self.splines)]
+        return polynomials(self.time, values, ("cubic",) * values.shape[1])[:3]
 
 
 Drive = TypeVar("Drive", Mesh, Pieces)
@@ -92,8 +102,8 @@ class Case(Generic[Drive]):
     psi0
         Initial azimuth in rad.
     field
-        Harmonics of the wind field for the outputs, at the ends of all steps or the samples of the
-        run, ``(time, channel)``.
+        Harmonics of the wind field for the outputs, at the samples of the run,
+        ``(sample, channel)``.
     """
 
     drive: Drive
@@ -123,7 +133,7 @@ class Rollout:
 
 
 def mesh_of(driven: Trajectory, step: float | None, between: Between | Sequence[Between]) -> Mesh:
-    """Divide the intervals between samples into steps and interpolate the inputs.
+    """Divide the intervals between samples into steps.
 
     Parameters
     ----------
@@ -137,7 +147,7 @@ def mesh_of(driven: Trajectory, step: float | None, between: Between | Sequence[
     Raises
     ------
     DfsmError
-        So small a step that the inputs along it would fill the memory.
+        So small a step that there would be more than can be waited for.
     """
     longest, intervals = float(np.diff(driven.time).max()), len(driven) - 1
     parts = 1.0 if step is None else longest / step * (1 - 1e-9)
@@ -150,92 +160,25 @@ def mesh_of(driven: Trajectory, step: float | None, between: Between | Sequence[
             f"of at least {least:.3g} s, or a shorter time window"
         )
     every = max(1, int(np.ceil(parts)))
-    parts = np.arange(2 * every) / (2 * every)
-    time = at_parts(driven.time[:, None], parts)[:, 0]
-    kinds = each(driven, between)
-    held = np.array([kind == "hold" for kind in kinds], dtype=bool)
-    inputs = interpolated(driven, kinds, parts)
-    return Mesh(time, inputs, every, held if held.any() else None)
-
-
-def at_steps(field: Trajectory, mesh: Mesh, between: Between) -> Array:
-    """What drives outputs alone, at the ends of all steps, ``(step + 1, channel)``.
-
-    Interpolated as `mesh_of` does with the inputs.
-    """
-    if mesh.every == 1 or not field.channels:
-        return field.values
-    kinds = (between,) * len(field.channels)
-    return interpolated(field, kinds, np.arange(mesh.every) / mesh.every)
+    return Mesh(driven.time, driven.values, each(driven, between), every)
 
 
 # -- fixed steps --------------------------------------------------------------------------------
 
 
-def march(model: DFSM, cases: Iterable[Case[Mesh]]) -> Iterator[Rollout]:
-    """Classical RK4, one thread per processor; an accelerator takes all runs in one batch.
-
-    On a processor XLA keeps a loop on one core, and a single run stays in its cache where a batch
-    does not. Runs are marched while the next are being prepared.
-
-    Parameters
-    ----------
-    model
-        The surrogate.
-    cases
-        One per run, consumed in order; lengths may differ.
-
-    Yields
-    ------
-    Rollout
-        In the order of `cases`.
-    """
-    if jax.default_backend() != "cpu":
-        yield from _march_batch(model, list(cases))
-        return
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for rollouts in pool.map(lambda case: _march_batch(model, [case]), cases):
-            yield from rollouts
-
-
-def _march_batch(model: DFSM, cases: Sequence[Case[Mesh]]) -> list[Rollout]:
-    padded = -(-max(c.drive.steps for c in cases) // _PAD) * _PAD
-    h = np.zeros((len(cases), padded))
-    inputs = np.zeros((len(cases), 2 * padded + 1, cases[0].drive.inputs.shape[1]))
-    for i, m in enumerate(c.drive for c in cases):
-        h[i, : m.steps] = np.diff(m.time[::2])
-        inputs[i, : len(m.time)] = m.inputs
-        inputs[i, len(m.time) :] = m.inputs[-1]
-    x0, psi0 = np.stack([c.x0 for c in cases]), np.array([c.psi0 for c in cases])
-    field = np.zeros((len(cases), padded + 1, cases[0].field.shape[1]))
-    for i, c in enumerate(cases):
-        field[i, : len(c.field)] = c.field
-    held = cases[0].drive.held
-    drive = (inputs, field, held)
-    states, outputs, outside = map(np.asarray, _march(model, x0, psi0, h, drive))
-    rollouts = []
-    for i, m in enumerate(c.drive for c in cases):
-        rows = slice(0, m.steps + 1, m.every)
-        rollouts.append(Rollout(states[i, rows], outputs[i, rows], outside[i, rows], True))
-    return rollouts
-
-
-@eqx.filter_jit
-def _march(
+def stepped(
     model: DFSM,
-    x0: Array,
-    psi0: Array,
-    h: Array,
-    drive: tuple[Array, Array, NDArray[np.bool_] | None],
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    model, (inputs, field) = model.prepared(), map(jnp.asarray, drive[:2])
-
-    def states(x0: jax.Array, h: jax.Array, v: jax.Array) -> jax.Array:
-        return rk4(model, x0, h, stages(v, drive[2]))
-
-    xs = jax.vmap(states)(jnp.asarray(x0), jnp.asarray(h), inputs)
-    seen = observe(model, jnp.asarray(h), xs, (inputs[:, ::2], field), jnp.asarray(psi0))
-    return xs, *seen
+    x: jax.Array,
+    psi: jax.Array,
+    h: float | jax.Array,
+    drive: tuple[jax.Array, ...],
+) -> tuple[jax.Array, jax.Array]:
+    """States and azimuth one step of classical RK4 on; `drive` as in `rk4_step`."""
+    new, _ = rk4_step(partial(rate, model), x, h, (drive[0], drive[1], drive[2]))
+    turn = model.signals.azimuth_rate
+    if turn is not None:
+        psi = psi + 0.5 * h * turn[1] * (x[turn[0]] + new[turn[0]])
+    return new, psi
 
 
 def stages(v: jax.Array, held: NDArray[np.bool_] | jax.Array | None) -> Stages:
@@ -319,8 +262,18 @@ def observe(
         omega = turn[1] * xs[..., turn[0]]
         angle = jnp.cumsum(0.5 * h * (omega[..., 1:] + omega[..., :-1]), axis=-1)
         psi = psi0[..., None] + jnp.concatenate([jnp.zeros_like(omega[..., :1]), angle], axis=-1)
-    groups = model.signals.order.split_exogenous(drive[0])
-    return model.output(xs, *groups, psi, drive[1]), model.region.outside(model.join(xs, *groups))
+    return seen(model, xs, *drive, psi)
+
+
+def seen(
+    model: DFSM, xs: jax.Array, inputs: jax.Array, field: jax.Array, psi: jax.Array | None
+) -> tuple[jax.Array, jax.Array]:
+    """Outputs ``(..., output)`` at states, exogenous inputs, wind field and azimuth ``(...)``.
+
+    And whether any input is outside its range, ``(...)``.
+    """
+    groups = model.signals.order.split_exogenous(inputs)
+    return model.output(xs, *groups, psi, field), model.region.outside(model.join(xs, *groups))
 
 
 # -- adaptive steps -----------------------------------------------------------------------------

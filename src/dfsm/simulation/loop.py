@@ -20,8 +20,7 @@ from dfsm.controllers.controller import Controller
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
-from dfsm.numerics.runge_kutta import rk4_step
-from dfsm.simulation.integrate import observe, rate
+from dfsm.simulation.integrate import observe, stepped
 from dfsm.simulation.wires import Wires
 
 
@@ -137,7 +136,7 @@ class March:
         for step in range(self.per_call):
             path.append(x)
             ends = tuple(wires.with_commands(part[step], commands) for part in legs)
-            x, psi = _plant_step(model, x, psi, h, ends)
+            x, psi = stepped(model, x, psi, h, ends)
         return (x, psi, commands, state), (jnp.stack(path), commands, seen)
 
     def path(self, last: jax.Array, out: tuple[jax.Array, jax.Array, jax.Array]) -> Path:
@@ -152,17 +151,6 @@ class March:
         h = jnp.repeat(drive.h, self.per_call)
         outputs, outside = observe(model, h, states, (inputs, drive.field), drive.psi0)
         return Path(states, inputs[:, : len(model.signals.controls)], outputs, outside, seen)
-
-
-def _plant_step(
-    model: DFSM, x: jax.Array, psi: jax.Array, h: jax.Array, ends: tuple[jax.Array, ...]
-) -> tuple[jax.Array, jax.Array]:
-    """States and azimuth one step on."""
-    new, _ = rk4_step(partial(rate, model), x, h, ends)  # pyright: ignore[reportArgumentType]
-    turn = model.signals.azimuth_rate
-    if turn is not None:
-        psi = psi + 0.5 * h * turn[1] * (x[turn[0]] + new[turn[0]])
-    return new, psi
 
 
 def _plain(state: Any) -> Any:
@@ -239,7 +227,7 @@ class HostLoop:
             path = []
             for parts in zip(*wires.along(v), strict=True):
                 ends = tuple(wires.with_commands(part, told) for part in parts)
-                x, psi = _plant_step(model, x, psi, h, ends)
+                x, psi = stepped(model, x, psi, h, ends)
                 path.append(x)
             now = wires.measured(model, x, wires.with_commands(v[-1], told), (psi, field))
             return jnp.stack(path), psi, now

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
-from dfsm.data.between import Between, Chosen
+from dfsm.data.between import Chosen
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
@@ -29,18 +29,16 @@ from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import require_constant, require_field
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.drawn_run import DrawnRun
-from dfsm.simulation.fastest import REACH, fastest_rate
+from dfsm.simulation.fastest import REACH, fastest_rates
 from dfsm.simulation.integrate import (
     Case,
     Drive,
-    Mesh,
     Rollout,
     adapt,
-    at_steps,
-    march,
     mesh_of,
     pieces_of,
 )
+from dfsm.simulation.march import march
 
 # A rollout ends where a state is this many times its training half-range from the middle.
 ESCAPE = 10.0
@@ -77,8 +75,7 @@ class SimulationSettings:
         Tolerances of the adaptive methods; `atol` is relative to each state's training spread.
     interpolation
         Inputs between samples: ``"hold"``, ``"linear"`` or ``"cubic"`` spline, for all or by name;
-        None does as the model does. A wind field, which drives outputs alone, is joined by lines
-        unless all are splines.
+        None does as the model does.
     """
 
     method: Method = "rk4"
@@ -240,35 +237,36 @@ def simulate(
     starts = None if initial is None else _starts(model, initial, len(batch))
 
     between = model.signals.between_samples(settings.interpolation)
-    beside: Between = "cubic" if settings.interpolation == "cubic" else "linear"
 
-    def case(i: int, drive: Drive, field: Array) -> Case[Drive]:
+    def case(i: int, drive: Drive) -> Case[Drive]:
         begins = float(driven[i].time[0])
         x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
-        return Case(drive, x0, initial_azimuth(model, batch[i], begins), field)
+        return Case(drive, x0, initial_azimuth(model, batch[i], begins), fields[i].values)
 
-    def marched(i: int) -> Case[Mesh]:
-        mesh = mesh_of(driven[i], steps[i].largest, between)
-        return case(i, mesh, at_steps(fields[i], mesh, beside))
+    def judged(i: int, rollout: Rollout) -> Simulation:
+        result = _result(model, batch[i], driven[i], rollout)
+        return replace(result, note=steps[i].note)
 
     begin = clock.perf_counter()
-    each = range(len(batch))
-    steps = [_stepping(model, run, settings) for run in driven]
-    fixed = [i for i in each if steps[i].method == "rk4"]
+    steps = _steppings(model, driven, settings)
     tolerances = (settings.rtol, settings.atol)
+    fixed = [i for i, step in enumerate(steps) if step.method == "rk4"]
+    meshes = {i: mesh_of(driven[i], steps[i].largest, between) for i in fixed}
 
-    def adapted(i: int) -> Rollout:
-        one = case(i, pieces_of(driven[i], between), fields[i].values)
-        return adapt(model, one, steps[i].method, tolerances)
+    def adapted(i: int) -> Simulation:
+        one = case(i, pieces_of(driven[i], between))
+        return judged(i, adapt(model, one, steps[i].method, tolerances))
 
-    marching = march(model, (marched(i) for i in fixed)) if fixed else iter(())
-    solved = (next(marching) if steps[i].method == "rk4" else adapted(i) for i in each)
-    results = [
-        replace(_result(model, r, d, rollout), note=step.note)
-        for r, d, rollout, step in zip(batch, driven, solved, steps, strict=True)
-    ]
+    marched = march(
+        model,
+        list(meshes.values()),
+        lambda k: case(fixed[k], meshes[fixed[k]]),
+        lambda k, rollout: judged(fixed[k], rollout),
+    )
+    found = dict(zip(fixed, marched, strict=True))
+    results = [found[i] if i in found else adapted(i) for i in range(len(batch))]
     wall = (clock.perf_counter() - begin) / len(batch)
     results = [replace(r, wall_time=wall) for r in results]
     _warn(results)
@@ -284,14 +282,20 @@ class _Stepping:
     note: str = ""
 
 
-def _stepping(model: DFSM, driven: Trajectory, settings: SimulationSettings) -> _Stepping:
+def _steppings(
+    model: DFSM, driven: Sequence[Trajectory], settings: SimulationSettings
+) -> list[_Stepping]:
     """Steps that RK4 can take with this model; very many of them are left to a stiff method."""
-    asked = settings.step
     if settings.method != "rk4":
-        return _Stepping(settings.method, asked)
+        return [_Stepping(settings.method, settings.step)] * len(driven)
+    rates = fastest_rates(model, [run.values for run in driven])
+    return [_stepping(run, rate, settings) for run, rate in zip(driven, rates, strict=True)]
+
+
+def _stepping(driven: Trajectory, rate: float, settings: SimulationSettings) -> _Stepping:
+    asked = settings.step
     longest = float(np.diff(driven.time).max())
     step = longest if asked is None else min(asked, longest)
-    rate = fastest_rate(model, driven.values)
     parts = rate * step / REACH
     # Beyond the second limit, no method would get anywhere.
     if not 1 + 1e-9 < parts < _HOPELESS:

@@ -13,7 +13,9 @@ from dfsm.core.files import existing_file
 from dfsm.core.progress import track
 from dfsm.data.info import ChannelInfo, RunInfo, describe, gap_warning
 from dfsm.data.readers.hawc2 import is_hawc2, read_hawc2
-from dfsm.data.readers.openfast import read_openfast
+from dfsm.data.readers.long_run import LongRun
+from dfsm.data.readers.openfast import long_openfast, read_openfast
+from dfsm.data.readers.parquet import long_parquet
 from dfsm.data.readers.tables import read_table, write_table
 from dfsm.data.readers.turbsim import read_turbsim
 from dfsm.data.trajectory import Trajectory
@@ -26,6 +28,7 @@ __all__ = [
     "RunInfo",
     "WindField",
     "describe",
+    "describe_all",
     "disk_wind",
     "gap_warning",
     "read",
@@ -113,13 +116,51 @@ def read_all(
     DfsmError
         A pattern matches nothing, a file is missing, or one cannot be read.
     """
+    return [read(path, step) for path in track(_paths(patterns, base), "Reading runs")]
+
+
+def describe_all(
+    patterns: Iterable[str | Path], base: Path | None = None, step: float | None = None
+) -> list[RunInfo]:
+    """Describe every file that the patterns name, holding one run at a time.
+
+    Of a long binary `.outb` or Parquet file no more than one channel is held.
+
+    Parameters
+    ----------
+    patterns, base, step
+        As for `read_all`.
+
+    Returns
+    -------
+    list[RunInfo]
+        One per file, what `describe` says of it.
+
+    Raises
+    ------
+    DfsmError
+        As `read_all`.
+    """
+    paths = track(_paths(patterns, base), "Reading runs")
+    return [describe((_long(path) if step is None else None) or read(path, step)) for path in paths]
+
+
+def _long(path: Path) -> LongRun | None:
+    suffix = path.suffix.lower()
+    if suffix == ".outb":
+        return long_openfast(path)
+    return long_parquet(path) if suffix in (".parquet", ".pq") else None
+
+
+def _paths(patterns: Iterable[str | Path], base: Path | None) -> list[Path]:
+    """Files that the patterns name, each once."""
     if isinstance(patterns, str | Path):
         patterns = [patterns]
     paths: dict[Path, Path] = {}
     for pattern in patterns:
         for path in _expand(pattern, base):
             paths.setdefault(path.resolve(), path)
-    return [read(path, step) for path in track(list(paths.values()), "Reading runs")]
+    return list(paths.values())
 
 
 def with_wall_times(runs: Iterable[Trajectory], path: str | Path) -> list[Trajectory]:

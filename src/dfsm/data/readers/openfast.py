@@ -15,13 +15,15 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.files import existing_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
+from dfsm.data.readers.long_run import LONG, LongRun, long_run
 from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -31,6 +33,8 @@ DEFAULT_NAME_WIDTH = 10
 # OpenFAST uses 10 or 20 characters; anything far above is a corrupted header, not a name.
 MAX_NAME_WIDTH = 1024
 HEADER_LINES = 200
+# Numbers that are decoded at once of a long file.
+_BLOCK = 2**20
 # ROSCO's own logs: .dbg, .dbg2, .dbg3 by LoggingLevel (`Debug` in ROSCO_IO.f90).
 ROSCO_LOG = ".dbg"
 # A unit in brackets, blanks and all, or a word.
@@ -80,6 +84,11 @@ class _Header:
     units: tuple[str, ...]
     scales: tuple[float, ...] | None
     left_over: int
+    offsets: tuple[float, ...] = ()
+    format_id: int = UNCOMPRESSED
+    samples: int = 0
+    times: tuple[float, float] = (0.0, 1.0)
+    begins: int = 0
 
 
 def _read_binary(path: Path) -> Trajectory:
@@ -97,10 +106,7 @@ def _read_binary(path: Path) -> Trajectory:
     codes = packed[:, 1:]
     notes = []
     if header.left_over:
-        notes.append(
-            f"{header.left_over} bytes follow the {len(values)} samples that the header announces: "
-            "passed over, and the run may have gone on"
-        )
+        notes.append(_left_over(header))
     channels = []
     for i, (name, unit) in enumerate(zip(header.names, header.units, strict=True)):
         step = None
@@ -114,6 +120,70 @@ def _read_binary(path: Path) -> Trajectory:
                 step = _step(values[:, i], codes[:, i])
         channels.append(Channel(name, unit, step))
     return assemble(path, data[:, 0], values, channels, notes=notes)
+
+
+def _left_over(header: _Header) -> str:
+    return (
+        f"{header.left_over} bytes follow the {header.samples} samples that the header announces: "
+        "passed over, and the run may have gone on"
+    )
+
+
+def long_openfast(path: Path) -> LongRun | None:
+    """A long binary run whose scale factors are usable; None for any other file.
+
+    Samples are decoded here, block by block; openfast-io holds all of them as Python numbers.
+    """
+    with path.open("rb") as stream:
+        if b"\0" not in stream.read(4096):
+            return None
+    header = _check_header(path)
+    count, samples = len(header.names), header.samples
+    packed = header.scales is not None
+    scales = header.scales or (1.0,) * count
+    offsets = header.offsets or (0.0,) * count
+    usable = all(scales) and np.isfinite([*scales, *offsets]).all()
+    if 8 * samples * count < LONG or not usable:
+        return None
+    first, second = header.times
+    time, begins = first + second * np.arange(samples), header.begins
+    if header.format_id == WITH_TIME:
+        with path.open("rb") as stream:
+            stream.seek(begins)
+            time = (np.fromfile(stream, "<i4", samples) - second) / first
+        begins += 4 * samples
+
+    def stored(place: int) -> NDArray[Any]:
+        kind = np.dtype("<i2" if packed else "<f8")
+        found = np.empty(samples, kind)
+        rows = max(1, _BLOCK // count)
+        with path.open("rb") as stream:
+            stream.seek(begins)
+            for start in range(0, samples, rows):
+                stop = min(start + rows, samples)
+                block = np.fromfile(stream, kind, (stop - start) * count)
+                if len(block) < (stop - start) * count:
+                    raise DfsmError(f"{path} has changed while it was read: try again")
+                found[start:stop] = block.reshape(-1, count)[:, place]
+        return found
+
+    def column(place: int) -> Array:
+        values = stored(place).astype(np.float64, copy=False)
+        if packed:
+            values -= offsets[place]
+            values /= scales[place]
+        return values
+
+    channels = []
+    for place, (name, unit) in enumerate(zip(header.names, header.units, strict=True)):
+        step = None
+        if packed:
+            codes = stored(place)
+            ends = np.array([codes.min(), codes.max()], dtype=np.float64)
+            step = _step((ends - offsets[place]) / scales[place], ends)
+        channels.append(Channel(name, unit, step))
+    notes = (_left_over(header),) if header.left_over else ()
+    return long_run(path, time, tuple(channels), column, notes=notes)
 
 
 def _step(values: Array, codes: Array) -> float | None:
@@ -139,25 +209,29 @@ def _check_header(path: Path) -> _Header:
         _check_range(path, "name width", width, 1, MAX_NAME_WIDTH)
         _check_range(path, "number of channels", count, 1)
         _check_range(path, "number of samples", samples, 2)
-        _check_time_fields(path, format_id, *take("<dd"))
-        scales = None
+        times = take("<dd")
+        _check_time_fields(path, format_id, *times)
+        scales, offsets = None, ()
         if format_id != UNCOMPRESSED:
             scales = take(f"<{count}f")
-            take(f"<{count}f")
+            offsets = take(f"<{count}f")
         (description,) = take("<i")
         _check_range(path, "description length", description, 0)
         take(f"<{description}s")
         names = _texts(take(f"<{(count + 1) * width}s")[0], width)
         units = _texts(take(f"<{(count + 1) * width}s")[0], width)
         row = count * (8 if format_id == UNCOMPRESSED else 2) + 4 * (format_id == WITH_TIME)
-        expected = stream.tell() + samples * row
+        begins = stream.tell()
+        expected = begins + samples * row
     if size < expected:
         raise DfsmError(
             f"{path} is truncated: its header announces {count} channels and {samples} samples, "
             f"which makes {expected} bytes, but it has {size}; copy it again or rerun the "
             "simulation"
         )
-    return _Header(names[1:], tuple(map(_unit, units[1:])), scales, size - expected)
+    told = tuple(map(_unit, units[1:]))
+    more = (offsets, format_id, samples, (times[0], times[1]), begins)
+    return _Header(names[1:], told, scales, size - expected, *more)
 
 
 def _taker(path: Path, stream: BinaryIO, size: int) -> Callable[[str], tuple]:

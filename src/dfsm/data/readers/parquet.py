@@ -23,6 +23,7 @@ from dfsm.data.readers.columns import (
     uniform_times,
 )
 from dfsm.data.readers.guard import check_run_name
+from dfsm.data.readers.long_run import LONG, LongRun, long_run
 from dfsm.data.readers.stamps import Stamps, since_first
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.errors import DfsmError
@@ -54,11 +55,7 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
-        raise DfsmError(
-            f"{path} is no readable Parquet file ({reason}): it is damaged or of another kind; "
-            "write it again"
-        ) from error
+        raise _unreadable(path, error) from error
     schema = _texts(table.schema.metadata)
     _check_header(path, table, schema)
     units = _pandas_units(schema)
@@ -87,6 +84,76 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         name=check_run_name(path, schema.get("dfsm.name", "")) or None,
         wall_time=_number(path, schema, "dfsm.wall_time") if "dfsm.wall_time" in schema else None,
         notes=(*_notes(path, schema), *notes),
+    )
+
+
+def long_parquet(path: Path) -> LongRun | None:
+    """A long run of plain columns; None for all else, which `read_parquet` reads or refuses."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            rows, schema = file.metadata.num_rows, file.schema_arrow
+    except (pa.ArrowException, OSError, ValueError):
+        return None
+    metadata = _texts(schema.metadata)
+    if 8 * rows * len(schema) < LONG or (
+        _HEADER in metadata and metadata[_HEADER] != _header_digest(schema, rows)
+    ):
+        return None
+    units = _pandas_units(metadata)
+    try:
+        fields = [_with_shared(path, field, metadata) for field in schema]
+        channels = [_channel(path, field, units) for field in fields]
+        at, time = None, np.empty(0)
+        if "dfsm.time_start" in metadata:
+            step = _number(path, metadata, "dfsm.time_step")
+            time = _number(path, metadata, "dfsm.time_start") + step * np.arange(rows)
+        else:
+            at = time_column(path, channels)
+        wall = _number(path, metadata, "dfsm.wall_time") if "dfsm.wall_time" in metadata else None
+        notes, name = _notes(path, metadata), check_run_name(path, metadata.get("dfsm.name", ""))
+    except DfsmError:
+        return None
+    plain = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    if not all(any(kind(field.type) for kind in plain) for field in fields):
+        return None
+    keep = [i for i in range(len(fields)) if i != at]
+
+    def column(i: int) -> Array:
+        values, done, name = np.empty(rows), 0, fields[i].name
+        try:
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+                # Group by group: a reader of all groups holds all of the column.
+                for group in range(file.num_row_groups):
+                    for batch in file.iter_batches(
+                        2**18, row_groups=[group], columns=[name], use_threads=False
+                    ):
+                        part = pa.Table.from_batches([batch]).select([name])
+                        values[done : done + len(part)] = _column(path, part, 0, fields[i])
+                        done += len(part)
+        except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+            raise _unreadable(path, error) from error
+        pa.default_memory_pool().release_unused()
+        return values
+
+    return long_run(
+        path,
+        time if at is None else column(at),
+        tuple(channels[i] for i in keep),
+        lambda place: column(keep[place]),
+        name=name or None,
+        wall_time=wall,
+        notes=tuple(notes),
+    )
+
+
+def _unreadable(path: Path, error: BaseException) -> DfsmError:
+    reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
+    return DfsmError(
+        f"{path} is no readable Parquet file ({reason}): it is damaged or of another kind; "
+        "write it again"
     )
 
 
@@ -124,7 +191,7 @@ def write_parquet(trajectory: Trajectory, path: Path, *, packed: bool) -> None:
             coded[channel.name] = "DELTA_BINARY_PACKED"
         fields.append(pa.field(channel.name, arrays[-1].type, metadata=known))
     table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=schema))
-    schema[_HEADER] = _header_digest(table)
+    schema[_HEADER] = _header_digest(table.schema, table.num_rows)
     table = table.replace_schema_metadata(schema)
     options: dict[str, Any] = {"compression": "zstd", "compression_level": 19 if packed else 3}
     options["write_page_checksum"] = True
@@ -152,17 +219,17 @@ def _floats(column: pa.ChunkedArray) -> Array:
     return np.concatenate([np.from_dlpack(part).astype(np.float64) for part in column.chunks])
 
 
-def _header_digest(table: pa.Table) -> str:
+def _header_digest(schema: pa.Schema, rows: int) -> str:
     """SHA-256 of what the checksums of pages leave out: sizes, names, types and metadata."""
-    fields = [[f.name, str(f.type), sorted(_texts(f.metadata).items())] for f in table.schema]
-    schema = {k: v for k, v in _texts(table.schema.metadata).items() if k != _HEADER}
-    text = json.dumps([table.num_rows, fields, sorted(schema.items())])
+    fields = [[f.name, str(f.type), sorted(_texts(f.metadata).items())] for f in schema]
+    known = {k: v for k, v in _texts(schema.metadata).items() if k != _HEADER}
+    text = json.dumps([rows, fields, sorted(known.items())])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _check_header(path: Path, table: pa.Table, schema: Mapping[str, str]) -> None:
     if _HEADER in schema:
-        whole = schema[_HEADER] == _header_digest(table)
+        whole = schema[_HEADER] == _header_digest(table.schema, table.num_rows)
     else:
         # A damaged list of metadata is passed over by the library as if there were none.
         with path.open("rb") as stream:
