@@ -8,7 +8,7 @@ PIP_OPTIONS := --quiet --disable-pip-version-check --no-compile
 # Long files first, each file in one process: its models are fitted once.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test studies lint style types contracts wheel bench clean
+.PHONY: demo test studies lint style types contracts wheel docs bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/demo.py --output out
@@ -44,6 +44,11 @@ wheel: $(VENV)/.installed-dev
 	$(BIN)/twine check --strict dist/*.whl
 	$(BIN)/python .ci/check_wheel.py dist/*.whl
 
+# The documentation as a site in out/site; any warning fails.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "open out/site/index.html"
+
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks
 
@@ -61,3 +66,7 @@ $(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
 $(VENV)/.installed-dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install $(PIP_OPTIONS) -e '.[dev]'
 	touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	touch $@

@@ -1,4 +1,4 @@
-"""Rollout errors of the demo's models on the test seeds: what the README states."""
+"""Rollout errors of the demo's models on the test seeds: what docs/results/accuracy.md states."""
 
 from __future__ import annotations
 

@@ -33,16 +33,16 @@ _PANELS = (
     ("training_s", 1.0, "Training time", "s"),
     ("evaluation_ratio", 1.0, "Cost of one evaluation", "relative to the linear fit"),
 )
-_GREY, _PALE = "#5a6570", "#d9dee3"
+GREY, _PALE = "#5a6570", "#d9dee3"
 _DASHED: dict[str, Any] = {"linewidth": 0.8, "linestyle": (0, (4, 3))}
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 8.0,
     "axes.titlesize": 8.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "axes.titlepad": 6.0,
     "axes.linewidth": 0.6,
-    "axes.edgecolor": _GREY,
+    "axes.edgecolor": GREY,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "lines.linewidth": 1.2,
@@ -55,38 +55,42 @@ _LEAST = 1e-15
 
 def draw_scaling(figures: Mapping[str, Any], path: Path) -> None:
     """Error, training time and evaluation cost over inputs; the file's ending is the format."""
-    with mpl.rc_context(_STYLE):
-        sheet, axes = _sheet(2.7, len(_PANELS))
+    with mpl.rc_context(STYLE):
+        page, axes = sheet(2.7, len(_PANELS))
         for place, panel in zip(axes, _PANELS, strict=True):
             _scaling_panel(place, figures, *panel)
-        _save(sheet, axes[0], path)
+        save(page, axes[0], path)
 
 
 def draw_orders(figures: Mapping[str, Any], path: Path) -> None:
     """Relative error over intervals, a panel per problem; the file's ending is the format."""
     problems = list(dict.fromkeys(curve["problem"] for curve in figures.values()))
-    with mpl.rc_context(_STYLE):
-        sheet, axes = _sheet(3.4, len(problems), sharey=True)
+    with mpl.rc_context(STYLE):
+        page, axes = sheet(3.4, len(problems), sharey=True)
         for place, problem in zip(axes, problems, strict=True):
             _orders_panel(place, [f for f in figures.values() if f["problem"] == problem])
             place.set_title(f"{problem}\n")
         axes[0].text(
-            0, 1.02, "relative error of the objective", transform=axes[0].transAxes, color=_GREY
+            0, 1.02, "relative error of the objective", transform=axes[0].transAxes, color=GREY
         )
-        _save(sheet, axes[0], path)
+        save(page, axes[0], path)
 
 
-def _sheet(height: float, panels: int, sharey: bool = False) -> tuple[Figure, Sequence[Axes]]:
-    """A sheet of a page's width, `height` in inches, with panels side by side."""
-    sheet = Figure(figsize=(7.5, height), layout="constrained")
-    FigureCanvasAgg(sheet)
-    return sheet, sheet.subplots(1, panels, sharey=sharey, squeeze=False)[0]
+def sheet(
+    height: float, panels: int, sharey: bool = False, stacked: bool = False
+) -> tuple[Figure, Sequence[Axes]]:
+    """A sheet of a page's width, `height` in inches, with panels side by side or stacked."""
+    page = Figure(figsize=(7.5, height), layout="constrained")
+    FigureCanvasAgg(page)
+    if stacked:
+        return page, list(page.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    return page, page.subplots(1, panels, sharey=sharey, squeeze=False)[0]
 
 
-def _save(sheet: Figure, named: Axes, path: Path) -> None:
+def save(page: Figure, named: Axes, path: Path) -> None:
     """Put the names of a panel's curves above all panels and write the sheet."""
     handles, names = named.get_legend_handles_labels()
-    sheet.legend(
+    page.legend(
         handles,
         names,
         loc="outside upper center",
@@ -97,7 +101,7 @@ def _save(sheet: Figure, named: Axes, path: Path) -> None:
     )
     stamp = {"Date": None} if path.suffix == ".svg" else {}
     path.parent.mkdir(parents=True, exist_ok=True)
-    sheet.savefig(path, metadata=stamp, dpi=200)
+    page.savefig(path, metadata=stamp, dpi=200)
 
 
 def _logarithmic(place: Axes, across: Sequence[int], what: str) -> None:
@@ -124,7 +128,7 @@ def _scaling_panel(
         place.plot(inputs, heights, label=name, clip_on=False, **look)
     _logarithmic(place, inputs, "inputs")
     place.set_title(f"{title}\n")
-    place.text(0, 1.02, unit, transform=place.transAxes, color=_GREY)
+    place.text(0, 1.02, unit, transform=place.transAxes, color=GREY)
     place.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
@@ -132,14 +136,14 @@ def _orders_panel(place: Axes, curves: Sequence[Mapping[str, Any]]) -> None:
     """Errors of every scheme, and below each a line as steep as theory says."""
     intervals, tolerance = curves[0]["intervals"], curves[0]["tolerance"]
     place.axhspan(_LEAST, tolerance, color="#eef1f4", linewidth=0, zorder=0)
-    place.text(intervals[0], 3 * _LEAST, "below the solver's tolerance", va="center", color=_GREY)
+    place.text(intervals[0], 3 * _LEAST, "below the solver's tolerance", va="center", color=GREY)
     for curve in sorted(curves, key=lambda curve: list(_SCHEMES).index(curve["scheme"])):
         name, look = _SCHEMES[curve["scheme"]]
         errors = [max(e, _LEAST) for e in curve["errors"]]
         place.plot(intervals, errors, label=name, clip_on=False, zorder=3, **look)
         guide = _guide(intervals, errors, curve["theory"], tolerance)
         place.plot(*guide, color=look["color"], zorder=2, **_DASHED)
-    place.plot([], [], color=_GREY, label="slope in theory", **_DASHED)
+    place.plot([], [], color=GREY, label="slope in theory", **_DASHED)
     _logarithmic(place, intervals, "intervals")
     place.set_ylim(_LEAST, 0.1)
     place.yaxis.set_major_locator(LogLocator(subs=(1.0,), numticks=5))

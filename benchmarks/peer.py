@@ -1,4 +1,4 @@
-"""A general identification package, jax-sysid, on the runs of docs/floating-turbine.md.
+"""A general identification package, jax-sysid, on the runs of docs/results/floating-turbine.md.
 
 It pins an older JAX than dfsm needs, so it lives in an environment of its own, made on first use
 with the Python that runs this (jax-sysid needs one before 3.13). The files that go there and back

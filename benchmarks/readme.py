@@ -1,4 +1,4 @@
-"""Write the tables of the README and of the pages in docs/, and figures, from measurements.
+"""Write the tables of the pages in docs/, and figures, from measurements.
 
 python -m benchmarks > figures.json && python -m benchmarks.readme figures.json
 """
@@ -15,8 +15,11 @@ from benchmarks import control_tables, field, fit_tables, startup, turbine_table
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = ("method.md", "optimal-control.md", "floating-turbine.md", "what-a-fit-says.md")
-FILES = (ROOT / "README.md", *(DOCS / name for name in PAGES))
+RESULTS = ("accuracy.md", "optimal-control.md", "floating-turbine.md")
+FILES = (
+    *(DOCS / name for name in ("method.md", "what-a-fit-says.md")),
+    *(DOCS / "results" / name for name in RESULTS),
+)
 
 TABLES = {
     "accuracy": fit_tables.accuracy_table,

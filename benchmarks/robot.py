@@ -1,4 +1,4 @@
-"""Write the tables of docs/two-link-robot.md, and the README's last one, from a full study.
+"""Write the tables of docs/results/two-link-robot.md, and the last of accuracy.md beside it.
 
 python -m benchmarks.robot     # takes as long as dfsm demo two-link-robot
 """
@@ -9,13 +9,14 @@ from benchmarks.readme import ROOT, fill
 from dfsm.demos.two_link_robot.article import robot_article
 from dfsm.demos.two_link_robot.study import study
 
-PAGE = ROOT / "docs" / "two-link-robot.md"
+RESULTS = ROOT / "docs" / "results"
+PAGES = (RESULTS / "two-link-robot.md", RESULTS / "accuracy.md")
 
 
 def main() -> None:
     """Run the study and write its tables."""
     tables = {t.key: t.markdown() for t in robot_article(study()).tables()}
-    for path in (PAGE, ROOT / "README.md"):
+    for path in PAGES:
         fill(path, tables)
 
 

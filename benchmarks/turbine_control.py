@@ -1,4 +1,4 @@
-"""Write the tables of docs/floating-turbine-control.md from the optimal control example.
+"""Write the tables of docs/results/floating-turbine-control.md from the optimal control example.
 
 python -m benchmarks.turbine_control out/turbine_control.json     # what the example wrote
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.readme import ROOT, fill
 from dfsm.report.article import Table
 
-PAGE = ROOT / "docs" / "floating-turbine-control.md"
+PAGE = ROOT / "docs" / "results" / "floating-turbine-control.md"
 
 
 def main() -> None:

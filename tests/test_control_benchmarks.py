@@ -1,4 +1,4 @@
-"""What docs/optimal-control.md states: its tables and figure, and the program in expressions."""
+"""What docs/results/optimal-control.md states: tables, figure, the program in expressions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
 def documented(name: str) -> list[list[str]]:
     """Rows of a table of the page, below its head."""
-    text = (ROOT / "docs" / "optimal-control.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "results" / "optimal-control.md").read_text(encoding="utf-8")
     block = text.split(f"<!-- {name} -->")[1].split("<!-- end -->")[0]
     rows = [line for line in block.splitlines() if line.startswith("|")][2:]
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]

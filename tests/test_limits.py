@@ -1,4 +1,4 @@
-"""What docs/floating-turbine.md says of limits: its data, against the runs they belong to."""
+"""What docs/results/floating-turbine.md says of limits: its data, against their runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The peer of docs/floating-turbine.md: inputs, judge and table row, without the peer itself."""
+"""The peer of docs/results/floating-turbine.md: inputs, judge and row, without the peer itself."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_the_row_has_a_dash_for_what_was_not_predicted(run, record):
 
 
 def test_the_page_has_the_peer_in_the_columns_of_the_other_models():
-    text = (ROOT / "docs" / "floating-turbine.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "results" / "floating-turbine.md").read_text(encoding="utf-8")
     tables = [
         text.split(f"<!-- {name} -->")[1].split("<!-- end -->")[0].strip().splitlines()
         for name in ("rollouts", "peer")

@@ -1,7 +1,8 @@
-"""The Python example of the README runs as it stands."""
+"""The README: its example runs, its commands and links exist, the first result is on one screen."""
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -28,7 +29,17 @@ def test_python_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_the_shell_commands_exist() -> None:
     names = {c.name or c.callback.__name__ for c in app.registered_commands if c.callback}
+    names |= {group.name for group in app.registered_groups if group.name}
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     used = {line.split()[1] for line in text.splitlines() if line.startswith("    dfsm ")}
+    told = re.search(r"More commands: (.*?) From Python:", text, re.DOTALL)
+    assert told is not None
+    used |= set(re.findall(r"`([a-z-]+)`", told[1]))
     assert used
     assert used <= names
+
+
+def test_the_first_result_is_on_one_screen() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert lines.index("    dfsm validate model/ test/*.outb -o report.html") < 40
+    assert sum("![" in line for line in lines) == 1

@@ -18,12 +18,12 @@ from dfsm.report.article import Table
 
 ROOT = Path(__file__).parents[1]
 
-ROBOT = "docs/two-link-robot.md"
+ROBOT = "docs/results/two-link-robot.md"
 
 pytestmark = pytest.mark.slow
 
 
-def table(name: str, page: str = "README.md") -> list[list[str]]:
+def table(name: str, page: str = "docs/results/accuracy.md") -> list[list[str]]:
     """Cells of a table of the documentation, below its head."""
     text = (ROOT / page).read_text(encoding="utf-8")
     block = text.split(f"<!-- {name} -->")[1].split("<!-- end -->")[0]
@@ -123,5 +123,5 @@ def test_robot_beyond() -> None:
     )
 
 
-def test_the_readme_repeats_the_page_of_the_robots() -> None:
+def test_the_accuracy_page_repeats_the_page_of_the_robots() -> None:
     assert table("beyond") == table("beyond", ROBOT)

@@ -20,7 +20,7 @@ from dfsm.report import publish as publishing
 
 pytestmark = pytest.mark.slow
 
-PAGE = Path(__file__).parents[1] / "docs" / "two-link-robot.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "two-link-robot.md"
 
 
 @pytest.fixture(scope="module")
