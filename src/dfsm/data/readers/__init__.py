@@ -12,6 +12,7 @@ from pathlib import Path
 from dfsm.core.files import existing_file
 from dfsm.core.progress import track
 from dfsm.data.info import ChannelInfo, RunInfo, describe, gap_warning
+from dfsm.data.readers.bladed import is_bladed, read_bladed
 from dfsm.data.readers.hawc2 import is_hawc2, read_hawc2
 from dfsm.data.readers.long_run import LongRun
 from dfsm.data.readers.openfast import long_openfast, read_openfast
@@ -57,9 +58,9 @@ def read(path: str | Path, step: float | None = None) -> Trajectory:
     Parameters
     ----------
     path
-        OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, HAWC2 `.sel` or `.hdf5`, `.csv` (`.txt`,
-        `.tsv`), `.parquet` or `.mat`; under another name, binary files are recognised by their
-        first bytes.
+        OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, HAWC2 `.sel` or `.hdf5`, Bladed `.%NN` or
+        `.$PJ`, `.csv` (`.txt`, `.tsv`), `.parquet` or `.mat`; under another name, binary files are
+        recognised by their first bytes.
     step
         Interval between samples in s for tables that hold no time.
 
@@ -79,6 +80,8 @@ def read(path: str | Path, step: float | None = None) -> Trajectory:
         return read_openfast(path)
     if is_hawc2(path):
         return read_hawc2(path)
+    if is_bladed(path):
+        return read_bladed(path)
     if suffix in TABLES:
         return read_table(path, step)
     with path.open("rb") as stream:

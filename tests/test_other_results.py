@@ -1,0 +1,182 @@
+"""Results of Bladed, QBlade and WEC-Sim, and uniform winds, written here as their formats go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dfsm.data.readers import read
+from dfsm.errors import DfsmError
+
+TIME = 0.05 * np.arange(30)
+
+
+def sentence(path: Path) -> str:
+    with pytest.raises(DfsmError) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# -- Bladed -------------------------------------------------------------------------------------
+
+SIGNALS = [
+    ("'Time from start'", "T", 10 + TIME),
+    ("POW2", "P", 1e6 + 1e5 * np.sin(TIME)),
+    ("'Rotor speed'", "A/T", 1 + 0.1 * np.cos(TIME)),
+    ("'Shaft Mx'", "FL", 1e5 * TIME),
+    ("'Yaw acceleration'", "A/TT", TIME**2),
+]
+CONTROL = np.stack([v for *_, v in SIGNALS], axis=1)
+# Time, place, signal.
+TOWER = np.arange(30 * 3 * 2, dtype=float).reshape(30, 3, 2) ** 2 / 7
+KINDS = {"R*4": "<f4", "R*8": "<f8", "I*4": "<i4", "I*2": "<i2"}
+TIME_AXIS = ["AXISLAB\t'Time'", "AXIUNIT\tT", "AXIMETH\t2", "MIN \t2.0000000E+000"]
+TIME_AXIS += ["STEP\t5.0000001E-002"]
+
+
+def bladed(
+    folder: Path,
+    number: str,
+    values: np.ndarray,
+    signals: list[str],
+    axes: list[str],
+    form: str = "R*4",
+    access: str = "D",
+    changed: tuple[str, str] = ("", ""),
+) -> Path:
+    """A header that breaks its long lines, and samples in text or binary."""
+    sizes = values.shape[::-1]
+    head = [f"FILE\trun.${number}", f"ACCESS\t{access}", f"FORM\t{'U' if access == 'D' else 'F'}"]
+    head += ["RECL\t4", f"FORMAT\t{form}", "CONTENT\t'POWPROD'", f"NDIMENS  {len(sizes)}"]
+    head += [f"DIMENS\t{'  '.join(map(str, sizes))}", "GENLAB\t'Some group'", *signals, *axes]
+    head += ["NVARS\t0", "ULOADS   1.0   2.0", "   3.0   4.0", "MEAN  1.0 2.0"]
+    header = folder / f"run.%{number}"
+    header.write_text("\r\n".join(head).replace(*changed) + "\r\n", encoding="latin-1")
+    data = folder / f"run.${number}"
+    if access == "D":
+        values.astype(KINDS[form]).tofile(data)
+    else:
+        np.savetxt(data, values.reshape(-1, values.shape[-1]), fmt="%15.7e")
+    return header
+
+
+def control(folder: Path, number: str = "04", **options) -> Path:
+    names, units = ([s[i] for s in SIGNALS] for i in (0, 1))
+    signals = ["VARIAB\t" + " ".join(names[:3]), " ".join(names[3:]), "VARUNIT\t" + " ".join(units)]
+    return bladed(folder, number, options.pop("values", CONTROL), signals, TIME_AXIS, **options)
+
+
+def tower(folder: Path, number: str = "25", **options) -> Path:
+    signals = ["VARIAB   MYT 'Tower Fx'", "VARUNIT   FL  F"]
+    place = options.pop("place", ["AXIVAL    -15.000  20.2000008", "   87.5"])
+    axes = ["AXISLAB  'Tower station height'", "AXIUNIT   L", "AXIMETH  3", *place, *TIME_AXIS]
+    return bladed(folder, number, TOWER, signals, axes, **options)
+
+
+@pytest.mark.parametrize("access", ["D", "S"])
+@pytest.mark.parametrize("form", ["R*4", "R*8", "I*4"])
+def test_bladed_in_text_and_binary(tmp_path, access, form):
+    whole = np.floor(CONTROL) if form == "I*4" else CONTROL
+    path = control(tmp_path, values=whole, form=form, access=access)
+    run = read(path)
+    assert run.names == ("Time from start", "POW2", "Rotor speed", "Shaft Mx", "Yaw acceleration")
+    assert [c.unit for c in run.channels] == ["s", "W", "rad/s", "N m", "rad/s^2"]
+    np.testing.assert_allclose(run.time, 2 + TIME, rtol=0, atol=1e-12)  # 0.05, not 0.050000001
+    np.testing.assert_allclose(run.values, whole, rtol=1e-7)
+    assert read(path.with_suffix(".$04")).digest == run.digest
+    steps = [c.step for c in run.channels]
+    if (access, form) == ("S", "R*4"):
+        # Eight digits: of numbers of some ten, of a million, of one.
+        np.testing.assert_allclose(steps[:3], [1e-6, 0.1, 1e-7], rtol=0.1)
+    elif access == "D":
+        assert steps == [None] * 5
+
+
+def test_bladed_at_several_places(tmp_path):
+    for access in ("D", "S"):
+        run = read(tower(tmp_path, access=access))
+        assert run.names[:3] == ("MYT at -15 m", "Tower Fx at -15 m", "MYT at 20.2 m")
+        np.testing.assert_allclose(run["Tower Fx at 87.5 m"], TOWER[:, 2, 1], rtol=1e-6)
+        np.testing.assert_allclose(run.values, TOWER.reshape(30, 6), rtol=1e-6)
+    named = tower(tmp_path, place=["AXITICK\t'Node 1' 'Node 2' ", "'Node 3'"])
+    assert read(named).names[-1] == "Tower Fx at Node 3"
+
+
+def test_a_project_of_bladed_is_all_its_groups(tmp_path):
+    control(tmp_path)
+    tower(tmp_path, access="S")
+    other = ("AXISLAB\t'Time'", "AXISLAB\t'Step number'")
+    control(tmp_path, "37", changed=other)
+    control(tmp_path, "41", values=CONTROL[:7])
+    project = tmp_path / "run.$PJ"
+    project.write_text("<project/>")
+    run = read(project)
+    assert run.names[:5] == read(tmp_path / "run.%04").names
+    assert run.names[5:] == read(tmp_path / "run.%25").names
+    assert run.notes == (
+        "run.%37 left out: its signals go over 'Step number'",
+        "run.%41 left out: its times are not those of run.%04",
+    )
+    assert "go over 'Step number', expected a time series" in sentence(tmp_path / "run.%37")
+    (tmp_path / "other.$PJ").write_text("<project/>")
+    assert "no results over time lie beside the project" in sentence(tmp_path / "other.$PJ")
+
+
+def test_a_run_of_bladed_that_ended_early(tmp_path):
+    path = tower(tmp_path, access="S")
+    data = tmp_path / "run.$25"
+    lines = data.read_text().splitlines(keepends=True)
+    data.write_text("".join(lines[:31])[:-4])
+    run = read(path)
+    np.testing.assert_allclose(run.values, TOWER[:10].reshape(10, 6), rtol=1e-6)
+    assert run.notes == (
+        "line 31 begins a time that not all 3 places have: left out",
+        "10 times, the header announces 30: the run ended early",
+    )
+    data.write_text("".join(lines[:33])[:-4])
+    assert "that record is left out" in read(path).notes[0]
+    # A length that is not known before the end.
+    assert len(read(control(tmp_path, changed=("DIMENS\t5  30", "DIMENS\t5  0")))) == 30
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (("FORMAT\tR*4", "FORMAT\tC*8"), "of type 'C*8', expected R*4, R*8, I*2, I*4"),
+        (("FORMAT\tR*4", "FORMAT\tR*8"), "600 bytes, but its header announces 5 signals"),
+        (("ACCESS\tD", "ACCESS\tX"), "ACCESS is 'X', expected D (binary) or S (text)"),
+        (("ACCESS\tD\r\n", ""), "is no header of Bladed: ACCESS is missing"),
+        (("DIMENS\t5  30", "DIMENS\t6  30"), "5 names and 5 units, but DIMENS announces 6"),
+        (("DIMENS\t5  30", "DIMENS\t5  7  30"), "DIMENS is 5 7 30 for 1 axes"),
+        (("DIMENS\t5  30", "DIMENS\t5  31"), "31 times of 4 bytes, which makes 620"),
+        (("DIMENS\t5  30", "DIMENS\t5  " + "9" * 5000), "expected the number of signals"),
+        (("STEP\t5.0000001E-002", "STEP\t0.0"), "STEP '0.0' of the axis 'Time' are no start"),
+    ],
+)
+def test_headers_of_bladed_that_do_not_fit(tmp_path, changed, said):
+    path = control(tmp_path, changed=changed)
+    told = sentence(path)
+    assert said in told
+    assert str(tmp_path) in told
+
+
+def test_samples_of_bladed_that_do_not_fit(tmp_path):
+    path = control(tmp_path)
+    data = tmp_path / "run.$04"
+    data.write_bytes(data.read_bytes()[:-3])
+    assert "597 bytes, but its header announces 5 signals at 1 place and 30 times" in sentence(path)
+    data.unlink()
+    assert "run.$04" in sentence(path)
+    data.write_bytes(b"")
+    assert "run.$04 is empty" in sentence(path)
+    data.write_bytes(b"some")
+    path.unlink()
+    assert "run.%04" in sentence(data)
+    path = tower(tmp_path, place=["MIN  0.0", "STEP 1.0"])
+    path.write_text(path.read_text().replace("DIMENS\t2  3  30", f"DIMENS\t2  {10**11}  30"))
+    assert "signals at one time are announced" in sentence(path)
+    path = tower(tmp_path, place=["AXIVAL 1.0 2.0"])
+    assert "2 places on the axis 'Tower station height', but DIMENS announces 3" in sentence(path)
