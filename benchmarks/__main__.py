@@ -1,8 +1,8 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-    [unseen] [limits] [matched] [control] [codesign] [exports] [peer] [dymos] [gpu]
-    [fuzz] [kill] [feedback]
+    [unseen] [limits] [matched] [control] [codesign] [loops] [tuning] [exports] [peer] [dymos]
+    [gpu] [fuzz] [kill] [feedback]
 
 Without names all but `peer` and `dymos`, which make environments of their own and install
 jax-sysid and dymos there, and `fuzz` and `kill`, which damage inputs and end commands for hours
@@ -35,6 +35,7 @@ from benchmarks import (
     gpu,
     kill,
     limits,
+    loops,
     matched,
     parameters,
     peer,
@@ -42,6 +43,7 @@ from benchmarks import (
     scaling,
     speed,
     startup,
+    tuning,
     unseen,
 )
 from dfsm.core.files import json_value
@@ -61,6 +63,8 @@ PARTS: dict[str, Callable[..., object]] = {
     "matched": matched.run,
     "control": control.run,
     "codesign": codesign.run,
+    "loops": loops.run,
+    "tuning": tuning.run,
     "exports": exports.run,
     "peer": peer.run,
     "dymos": dymos_peer.run,

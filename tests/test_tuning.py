@@ -182,6 +182,17 @@ def test_the_command_tunes_and_goes_on_where_it_was_ended(here, dfsm, fitted):
     repeated = json.loads(again.out)
     assert repeated["parameters"]["kp"]["after"] == after
     assert repeated["evaluations"] == said["evaluations"] - 2
+    # Runs of the truth are asked for, and taken once they are there.
+    write_config(Path("flown.yaml"), config | {"truth": {"folder": "flown", "flights": 2}})
+    lacking = dfsm("tune", "flown.yaml", "-o", "result").sentence
+    assert "flown/flight_1 lacks 1 of 1 runs (d): fly them" in lacking
+    for number in (1, 2):
+        Path(f"flown/flight_{number}").mkdir(parents=True, exist_ok=True)
+        Path(f"flown/flight_{number}/d.outb").symlink_to(Path("test/d.outb").resolve())
+    flown = json.loads(dfsm("tune", "flown.yaml", "-o", "result", "--json").out)
+    # The same runs whatever is flown: no gain in truth.
+    assert flown["best_flight"] == 1
+    assert flown["flights"][1]["true"] == flown["flights"][0]["true"]
     Path("mine").mkdir()
     Path("mine/thesis.txt").write_text("x")
     assert "holds thesis.txt" in dfsm("tune", "tune.yaml", "-o", "mine").sentence

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dfsm.config.sweep import load_sweep
 from dfsm.config.tune import load_tuning
 
 TEXT = (Path(__file__).parents[1] / "docs" / "tuning.md").read_text(encoding="utf-8")
@@ -20,6 +21,8 @@ def test_the_page_runs_from_top_to_bottom(capsys):
 
 
 def test_the_configuration_on_the_page_is_one(tmp_path):
-    (block,) = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
+    block, other = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
+    (tmp_path / "sweep.yaml").write_text(other, encoding="utf-8")
+    assert load_sweep(tmp_path / "sweep.yaml").settings(60.0).rated_speed == 7.56
     (tmp_path / "tune.yaml").write_text(block, encoding="utf-8")
     assert load_tuning(tmp_path / "tune.yaml").constraints[0].reference == 7.56

@@ -62,7 +62,9 @@ if TYPE_CHECKING:
     from dfsm.loops.load_cases import weibull_weights
     from dfsm.loops.regulator import linear_quadratic
     from dfsm.loops.sweep import Sweep, SweepSettings, sweep
-    from dfsm.loops.tuning import tune
+    from dfsm.loops.trust_region import ConfirmedTuning, TrustSettings, tune_with_truth
+    from dfsm.loops.truth import FlownRuns, SystemTruth
+    from dfsm.loops.tuning import TuningTask, tune
     from dfsm.loops.tuning_problem import Goal, Limit, TuneSettings, TuningProblem
     from dfsm.loops.tuning_result import TuneStatus, TuningResult
     from dfsm.models.dfsm import DFSM
@@ -204,6 +206,12 @@ _HOME = {
     "SweepSettings": "loops.sweep",
     "weibull_weights": "loops.load_cases",
     "tune": "loops.tuning",
+    "TuningTask": "loops.tuning",
+    "tune_with_truth": "loops.trust_region",
+    "TrustSettings": "loops.trust_region",
+    "ConfirmedTuning": "loops.trust_region",
+    "SystemTruth": "loops.truth",
+    "FlownRuns": "loops.truth",
     "TuningProblem": "loops.tuning_problem",
     "Goal": "loops.tuning_problem",
     "Limit": "loops.tuning_problem",

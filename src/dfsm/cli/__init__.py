@@ -25,6 +25,7 @@ from dfsm.cli.intervals import calibrate
 from dfsm.cli.optimize import optimize
 from dfsm.cli.report import report
 from dfsm.cli.simulate import simulate
+from dfsm.cli.sweep import sweep
 from dfsm.cli.terminal import (
     AsJson,
     Files,
@@ -73,6 +74,7 @@ app.command()(calibrate)
 app.command()(report)
 app.command()(wind)
 app.command("closed-loop")(closed_loop)
+app.command()(sweep)
 app.command()(tune)
 
 

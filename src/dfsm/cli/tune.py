@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dfsm.cli.closed_loop import controller_of
+from dfsm.cli.loops import loaded
 from dfsm.cli.terminal import AsJson, Quiet, fit_start, lines, print_json, say, working
 from dfsm.errors import hushed
 
 if TYPE_CHECKING:
+    from dfsm.loops.trust_region import ConfirmedTuning
     from dfsm.loops.tuning import TuningTask
 
 
@@ -25,7 +26,12 @@ def tune(
 ) -> None:
     """Tune a controller's gains on a model; goes on where it was ended."""
     from dfsm.core.lock import locked
-    from dfsm.loops.tuning_folder import check_tuning_target, open_journal, save_tuning
+    from dfsm.loops.tuning_folder import (
+        check_tuning_target,
+        open_journal,
+        save_tuning,
+        tuning_values,
+    )
     from dfsm.loops.tuning_result import TuneStatus
     from dfsm.report.tuning_article import tuning_article, write_tuning_page
 
@@ -35,14 +41,15 @@ def tune(
         known = open_journal(task, output)
         if known:
             say(f"going on with what {output} holds", quiet or as_json)
-        result = task.tune()
-        save_tuning(task, result, output, write_tuning_page)
+        confirmed = _confirmed(config, task)
+        result = task.tune() if confirmed is None else task.given(confirmed.values)
+        save_tuning(task, result, output, write_tuning_page, confirmed)
     if as_json:
-        print_json(result.to_dict())
+        print_json(tuning_values(result, confirmed))
     elif not quiet:
         from dfsm.cli.tables import print_article
 
-        say(lines(result.message), quiet)
+        say(lines(result.message if confirmed is None else confirmed.summary()), quiet)
         article = tuning_article(result)
         from dataclasses import replace
 
@@ -50,6 +57,18 @@ def tune(
         say(f"wrote {output}", quiet)
     if result.status in (TuneStatus.UNSTABLE, TuneStatus.INFEASIBLE, TuneStatus.INTERRUPTED):
         raise typer.Exit(1)
+
+
+def _confirmed(path: Path, task: TuningTask) -> ConfirmedTuning | None:
+    """Tune with the runs that were flown, where the file names a folder of them."""
+    from dfsm.config.tune import load_tuning
+    from dfsm.loops.trust_region import tune_with_truth
+    from dfsm.loops.truth import FlownRuns
+
+    truth = load_tuning(path).truth
+    if truth is None:
+        return None
+    return tune_with_truth(task, FlownRuns(path.parent / truth.folder), truth.settings())
 
 
 def tuning_task(path: Path) -> TuningTask:
@@ -61,28 +80,16 @@ def tuning_task(path: Path) -> TuningTask:
         What is wrong with the file, or with what it names.
     """
     from dfsm.config.tune import load_tuning
-    from dfsm.controllers.discon import read_discon
-    from dfsm.controllers.rosco import ROSCO
-    from dfsm.data.readers import read_all
     from dfsm.loops.tuning import TuningTask
-    from dfsm.models.model_folder import load
 
-    config, folder = load_tuning(path), path.parent
-    model = load(folder / config.model)
-    named = [config.runs] if isinstance(config.runs, str) else config.runs
-    runs = read_all(named, folder)
-    controller = controller_of(
-        str(folder / config.controller), None, config.interval or runs[0].time_step
-    )
-    deck = None
-    if isinstance(controller, ROSCO) and not config.controller.partition(":")[0].endswith(".py"):
-        deck = read_discon(folder / config.controller)
+    config = load_tuning(path)
+    found = loaded(config, path.parent)
     return TuningTask(
-        model,
-        runs,
-        controller,
-        config.problem(runs),
-        deck,
+        found.model,
+        found.runs,
+        found.controller,
+        config.problem(found.runs),
+        found.discon,
         config.measure,
-        config.settings(fit_start(model)),
+        config.settings(fit_start(found.model)),
     )

@@ -6,85 +6,63 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 from pydantic import Field
 
+from dfsm.config.loops import LoopsConfig
 from dfsm.config.parse import Strict, parse_file
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.loops.load_cases import weibull_weights
+from dfsm.loops.trust_region import TrustSettings
 from dfsm.loops.tuning_problem import Goal, Limit, TuneSettings, TuningProblem
-from dfsm.simulation.loop_cases import ClosedLoopSettings
 
 ADVICE = "write one, docs/tuning.md shows how"
 
 
-class Weibull(Strict):
-    """Shares of the time by the wind that each run stands for.
+class Flown(Strict):
+    """Where runs of the true system are, or will be.
 
     Attributes
     ----------
-    mean, shape
-        Of the Weibull distribution, in m/s.
-    wind
-        Channel of the wind; its mean, rounded to whole m/s, is a run's.
+    folder
+        See `FlownRuns`.
+    flights, tolerance, radius
+        See `TrustSettings`.
     """
 
-    mean: float
-    shape: float = 2.0
-    wind: str = "RotWind"
+    folder: str
+    flights: int = TrustSettings.flights
+    tolerance: float = TrustSettings.tolerance
+    radius: float = TrustSettings.radius
 
-    def weights(self, runs: Sequence[Trajectory]) -> list[float]:
-        """Share of every run."""
-        return weibull_weights(
-            [float(np.round(run[self.wind].mean())) for run in runs], self.mean, self.shape
-        )
+    def settings(self) -> TrustSettings:
+        """When to stop."""
+        return TrustSettings(flights=self.flights, tolerance=self.tolerance, radius=self.radius)
 
 
-class TuneConfig(Strict):
+class TuneConfig(LoopsConfig):
     """A whole file of `dfsm tune`.
 
     Attributes
     ----------
-    model
-        Folder that `dfsm fit` made; files are relative to the configuration.
-    controller
-        ROSCO's DISCON.IN, or file.py:name of a controller of your own.
-    runs
-        Result files or patterns: what drives the loops.
     parameters
         Lowest and highest value by name.
     objective, constraints
         See `Goal` and `Limit`.
-    weights
-        One number per run, or a Weibull distribution; default equal.
-    interval
-        Seconds between two calls of ROSCO; default the runs' samples.
-    measure
-        Signal of the model by measurement of the controller.
-    start, stop, start_up
-        Scored time in s, and how long before the loop begins.
     starts, seed, iterations, tolerance, pareto
         See `TuneSettings`.
+    truth
+        Confirm by runs that you fly, see `Flown`.
     """
 
-    model: str
-    controller: str
-    runs: str | list[str]
     parameters: dict[str, tuple[float, float]]
     objective: list[Goal]
     constraints: list[Limit] = Field(default_factory=list)
-    weights: list[float] | Weibull | None = None
-    interval: float | None = None
-    measure: dict[str, str] = Field(default_factory=dict)
-    start: float | None = None
-    stop: float | None = None
-    start_up: float = ClosedLoopSettings.start_up
     starts: int = TuneSettings.starts
     seed: int = TuneSettings.seed
     iterations: int = TuneSettings.iterations
     tolerance: float = TuneSettings.tolerance
     pareto: int = TuneSettings.pareto
+    truth: Flown | None = None
 
     def problem(self, runs: Sequence[Trajectory]) -> TuningProblem:
         """What is asked, over these runs.
@@ -94,12 +72,11 @@ class TuneConfig(Strict):
         DfsmError
             What `TuningProblem` refuses, or a run without the wind that its weight follows.
         """
-        weights = self.weights.weights(runs) if isinstance(self.weights, Weibull) else self.weights
         return TuningProblem(
             parameters=self.parameters,
             objective=self.objective,
             constraints=self.constraints,
-            weights=weights,
+            weights=self.shares(runs),
         )
 
     def settings(self, start: float | None) -> TuneSettings:
@@ -108,7 +85,7 @@ class TuneConfig(Strict):
         return TuneSettings(
             **{name: getattr(self, name) for name in own},
             start=start if self.start is None else self.start,
-            loop=ClosedLoopSettings(start_up=self.start_up),
+            loop=self.loop,
         )
 
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dfsm.controllers.controller import Controller
+from dfsm.controllers.discon import Discon
+from dfsm.controllers.tunable import tunable
 from dfsm.core.drawing import Drawn
 from dfsm.core.files import json_value
 from dfsm.core.settings import require, settings_class
@@ -16,6 +21,7 @@ from dfsm.errors import DfsmError, hushed, missing
 from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
+from dfsm.numerics.extremes import block_maxima, extrapolated, fit_gumbel
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loops
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 
@@ -24,6 +30,7 @@ if TYPE_CHECKING:
 
 # The record's own line among those of controllers.
 RECORDED = "recorded"
+AS_IT_IS = "as it is"
 
 
 @settings_class
@@ -40,6 +47,12 @@ class SweepSettings:
         Output that is the electrical power, for the annual energy; None for none.
     speed, rated_speed
         State or output, and the value in its unit over which its maximum is the overshoot.
+    extremes
+        Channels whose largest value is extrapolated from the maxima of blocks.
+    block
+        Length of a block in s.
+    years
+        Time in which the extrapolated value is exceeded once, of which the weights are shares.
     """
 
     start: float | None = None
@@ -48,10 +61,32 @@ class SweepSettings:
     power: str | None = None
     speed: str | None = None
     rated_speed: float | None = None
+    extremes: tuple[str, ...] = ()
+    block: float = 60.0
+    years: float = 50.0
 
     def __post_init__(self) -> None:
+        require(self.block > 0, "block", self.block, "seconds, more than 0")
+        require(self.years > 0, "years", self.years, "more than 0")
         both = (self.speed is None) == (self.rated_speed is None)
         require(both, "rated_speed", self.rated_speed, "a value where speed is set, else none")
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """A largest value, extrapolated.
+
+    Attributes
+    ----------
+    value, error
+        What is exceeded once in the time asked for, and its standard error, in the channel's unit.
+    blocks
+        Maxima from which it comes.
+    """
+
+    value: float
+    error: float
+    blocks: int
 
 
 @dataclass(frozen=True)
@@ -73,6 +108,8 @@ class Swept:
         Annual energy in MWh, of the share of the time that the weights stand for.
     overshoot
         Largest speed over the rated one, less 1.
+    extremes
+        Extrapolated largest values by channel.
     """
 
     name: str
@@ -81,6 +118,7 @@ class Swept:
     figures: Mapping[str, Figures]
     energy: float | None
     overshoot: float | None
+    extremes: Mapping[str, Extreme] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -137,6 +175,8 @@ class Sweep(Drawn):
             for name, f in swept.figures.items():
                 line |= {f"{name} mean": f.mean, f"{name} std": f.std, f"{name} max": f.maximum}
                 line |= {f"{name} travel": f.travel, f"{name} DEL": f.damage[f"{exponent:g}"]}
+            for name, e in swept.extremes.items():
+                line |= {f"{name} extreme": e.value, f"{name} extreme error": e.error}
             lines[swept.name] = line
         return pd.DataFrame.from_dict(lines, orient="index").dropna(axis=1, how="all")
 
@@ -183,7 +223,7 @@ def sweep(
     require(min(weights) > 0, "weights", weights, "numbers above 0")
     s = model.signals
     units = {c.name: c.unit for c in (*s.states, *s.controls, *s.outputs)}
-    named = [n for n in (settings.power, settings.speed) if n is not None]
+    named = [n for n in (settings.power, settings.speed, *settings.extremes) if n is not None]
     if lost := [n for n in named if n not in units]:
         raise DfsmError(f"settings: the model has {missing(lost, units)}")
     runs = [completed(run, s) for run in runs]
@@ -202,6 +242,40 @@ def sweep(
     return Sweep(swept, recorded, tuple(r.name for r in runs), tuple(weights), units)
 
 
+def gain_grid(
+    controller: Any, gains: Mapping[str, Sequence[float]], discon: Discon | None = None
+) -> dict[str, Any]:
+    """A controller as it is, and with every combination of some gains.
+
+    Parameters
+    ----------
+    controller
+        ROSCO in JAX, or an equinox module.
+    gains
+        Values by name, see `dfsm.controllers.tunable`.
+    discon
+        The DISCON.IN of ROSCO, where a name is one of its tuning parameters.
+
+    Returns
+    -------
+    dict
+        Controllers by what tells them apart: ``"omega_pc 0.2, zeta_pc 1"``.
+
+    Raises
+    ------
+    DfsmError
+        There is no such gain, or one without values.
+    """
+    for name, values in gains.items():
+        require(len(values) > 0, f"values of {name}", "none", "at least one")
+    tuned, found = tunable(controller, gains, discon), {AS_IT_IS: controller}
+    for values in product(*gains.values()) if gains else ():
+        pairs = zip(gains, values, strict=True)
+        label = ", ".join(f"{name} {value:.6g}" for name, value in pairs)
+        found[label] = tuned.at(np.array(values, dtype=float))
+    return found
+
+
 def _swept(
     name: str,
     loops: Sequence[ClosedLoopRun],
@@ -216,7 +290,27 @@ def _swept(
     endings = tuple(
         f"{r.trajectory.name}: {r.message}" for r, ok in zip(loops, done, strict=True) if not ok
     )
-    return _over_all(name, figures, endings, weights, settings, units)
+    swept = _over_all(name, figures, endings, weights, settings, units)
+    return replace(swept, extremes=_extremes([r.trajectory for r in loops], weights, settings)
+                   if all(done) else {})  # fmt: skip
+
+
+def _extremes(
+    runs: Sequence[Trajectory], weights: Sequence[float], settings: SweepSettings
+) -> dict[str, Extreme]:
+    """Long-term extremes of the channels that all runs hold."""
+    found = {}
+    for name in settings.extremes:
+        if any(name not in run for run in runs):
+            continue
+        try:
+            fits = [fit_gumbel(block_maxima(r.time, r[name], settings.block)) for r in runs]
+        except DfsmError as error:
+            raise DfsmError(f"extremes of {name}: {error}") from None
+        blocks = settings.years * HOURS_PER_YEAR * 3600 / settings.block
+        value, error = extrapolated(fits, weights, blocks)
+        found[name] = Extreme(value, error, sum(f.maxima for f in fits))
+    return found
 
 
 def _recorded(
@@ -228,12 +322,14 @@ def _recorded(
 ) -> Swept:
     """The record over the time that is scored."""
     names = [n for n in units if all(n in run for run in runs)]
-    figures = []
+    figures, parts = [], []
     for i, run in enumerate(runs):
         done = [r[i].trajectory for r in rolled if r[i].status is LoopStatus.COMPLETED]
         ends = (float(done[0].time[0]), float(done[0].time[-1])) if done else (None, None)
-        figures.append(case_figures(run.window(*ends).select(names)))
-    return _over_all(RECORDED, tuple(figures), (), weights, settings, units)
+        parts.append(run.window(*ends).select(names))
+        figures.append(case_figures(parts[-1]))
+    swept = _over_all(RECORDED, tuple(figures), (), weights, settings, units)
+    return replace(swept, extremes=_extremes(parts, weights, settings))
 
 
 def _over_all(

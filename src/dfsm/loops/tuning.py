@@ -123,6 +123,23 @@ class TuningTask:
             interrupted = True
         return self.result(search, before, starts, front, interrupted, begin)
 
+    def given(self, values: Mapping[str, float]) -> TuningResult:
+        """What values that were reached in another way give on the model.
+
+        Parameters
+        ----------
+        values
+            Of the parameters, by name.
+        """
+        before = self.evaluator(self.tuned.start)
+        search = self.search(before)
+        theta = np.array([values[name] for name in self.tuned.names])
+        judged = search.at(theta)
+        ends = (tuple(self.tuned.start), tuple(theta))
+        cost = None if judged is None else judged.objective
+        starts = [Start(*ends, cost, TuneStatus.SOLVED, 0)]
+        return self.result(search, before, starts, (), False, clock.perf_counter())
+
     def from_point(
         self, search: Search, first: Array, bounds: tuple[Array, Array] | None = None
     ) -> Start:
@@ -194,6 +211,11 @@ class TuningTask:
             values = dict(zip(self.tuned.names, at.tolist(), strict=True))
             found.append(FrontPoint(share, values, (float(first), float(second))))
         return _undominated(found, [g.weight for g in self.problem.objective])
+
+    def deck(self, theta: Array) -> Discon:
+        """The DISCON.IN with the lines changed that some values change, and no other."""
+        assert self.discon is not None
+        return self.discon.changed(self.tuned.changes(theta))
 
     # -- what comes of it -------------------------------------------------------------------------
 

@@ -119,6 +119,8 @@ class Evaluator:
         self._controller = jax.tree.map(jnp.asarray, tuned.controller)
         self._known: dict[tuple[float, ...], Figured] = {}
         self._journal: Path | None = None
+        # Whether a point that is known is not computed again.
+        self.remember = True
         self.evaluations = self.gradients = 0
 
     def keep(self, journal: Path) -> None:
@@ -133,7 +135,7 @@ class Evaluator:
     def __call__(self, theta: Array, slopes: bool = False) -> Figured:
         """Figures at a point, and their slopes if asked for."""
         key = tuple(float(t) for t in theta)
-        known = self._known.get(key)
+        known = self._known.get(key) if self.remember else None
         if known is not None and (known.slopes is not None or not slopes or not known.stable):
             return known
         self.evaluations += 1

@@ -15,11 +15,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from dfsm.controllers.discon import Discon, write_discon
+from dfsm.controllers.discon import write_discon
 from dfsm.controllers.gains import numbers_of
 from dfsm.core.files import check_file, json_value, visible, write_file, write_json
 from dfsm.core.version import __version__
 from dfsm.errors import DfsmError
+from dfsm.loops.trust_region import ConfirmedTuning
 from dfsm.loops.tuning import TuningTask
 from dfsm.loops.tuning_result import TuningResult
 
@@ -66,6 +67,7 @@ def save_tuning(
     result: TuningResult,
     folder: Path,
     write_page: Callable[[TuningResult, Path], None],
+    confirmed: ConfirmedTuning | None = None,
 ) -> None:
     """Write figures, page and the tuned controller.
 
@@ -77,6 +79,8 @@ def save_tuning(
         Made if need be.
     write_page
         Writes the page to a path.
+    confirmed
+        What the truth said, if it was asked.
 
     Raises
     ------
@@ -86,16 +90,24 @@ def save_tuning(
     folder.mkdir(parents=True, exist_ok=True)
     write_page(result, folder / PAGE)
     if task.discon is not None:
-        write_discon(tuned_deck(task.discon, result), folder / DECK)
+        theta = np.array(list(result.values.values()))
+        write_discon(task.deck(theta), folder / DECK)
     else:
         numbers = numbers_of(result.controller)
         write_json(folder / GAINS, {n: np.asarray(v).tolist() for n, v in numbers.items()})
-    write_json(folder / FIGURES, result.to_dict())
+    write_json(folder / FIGURES, tuning_values(result, confirmed))
 
 
-def tuned_deck(discon: Discon, result: TuningResult) -> Discon:
-    """The DISCON.IN with the lines changed that the tuning changed, and no other."""
-    return discon.changed(result.changes)
+def tuning_values(result: TuningResult, confirmed: ConfirmedTuning | None) -> dict[str, Any]:
+    """JSON values of a tuning, and of the flights that confirm it."""
+    values = result.to_dict()
+    if confirmed is not None:
+        values |= {
+            "confirmed": confirmed.status.name.lower(),
+            "flights": json_value([vars(f) for f in confirmed.flights]),
+            "best_flight": confirmed.best + 1,
+        }
+    return values
 
 
 def fingerprint(task: TuningTask) -> str:

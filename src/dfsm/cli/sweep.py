@@ -1,0 +1,63 @@
+"""The command `dfsm sweep`: many gains over many runs, and what each would do over a life."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dfsm.cli.loops import loaded
+from dfsm.cli.terminal import AsJson, Quiet, fit_start, print_json, say, working
+from dfsm.errors import hushed, printable
+
+
+def sweep(
+    config: Annotated[Path, typer.Argument(help="YAML file: model, controller, runs, gains.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for sweep.json, sweep.csv, sweep.html.")
+    ],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Close the loop with many gains over many runs: energy, loads, travel, extremes."""
+    from dfsm.cli.tables import print_article
+    from dfsm.config.sweep import load_sweep
+    from dfsm.core.files import check_file, write_file, write_json
+    from dfsm.loops.sweep import gain_grid
+    from dfsm.loops.sweep import sweep as run_sweep
+    from dfsm.report.article_page import write_article
+    from dfsm.report.sweep_article import sweep_article
+
+    asked = load_sweep(config)
+    output.mkdir(parents=True, exist_ok=True)
+    figures, lines, page = (output / f"sweep.{end}" for end in ("json", "csv", "html"))
+    for target in (figures, lines, page):
+        check_file(target)
+    with working(quiet), hushed():
+        found = loaded(asked, config.parent)
+        controllers = gain_grid(found.controller, asked.gains, found.discon)
+        swept = run_sweep(
+            found.model,
+            found.runs,
+            controllers,
+            weights=asked.shares(found.runs),
+            measurements=asked.measure,
+            settings=asked.settings(fit_start(found.model)),
+        )
+    article = sweep_article(swept, asked.exponent)
+    write_json(figures, swept.to_dict())
+    with write_file(lines) as temporary:
+        swept.table(asked.exponent).to_csv(temporary, index_label="controller")
+    write_article(article, page)
+    if as_json:
+        print_json(swept.to_dict())
+    elif not quiet:
+        print_article(article)
+        say(f"wrote {output}: {len(controllers)} controllers over {len(found.runs)} runs", quiet)
+    ended = [(c.name, text) for c in swept.controllers for text in c.endings]
+    for name, text in () if quiet else ended:
+        print(printable(f"{name}: {text}"), file=sys.stderr)
+    if ended:
+        raise typer.Exit(1)
