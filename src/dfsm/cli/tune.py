@@ -39,8 +39,6 @@ def tune(
     with locked(output), working(quiet), hushed():
         task = tuning_task(config)
         known = open_journal(task, output)
-        if known:
-            say(f"going on with what {output} holds", quiet or as_json)
         confirmed = _confirmed(config, task)
         result = task.tune() if confirmed is None else task.given(confirmed.values)
         save_tuning(task, result, output, write_tuning_page, confirmed)
@@ -54,7 +52,7 @@ def tune(
         from dataclasses import replace
 
         print_article(replace(article, sections=article.sections[:2]))
-        say(f"wrote {output}", quiet)
+        say(f"wrote {output}{', going on with what it held' if known else ''}", quiet)
     if result.status in (TuneStatus.UNSTABLE, TuneStatus.INFEASIBLE, TuneStatus.INTERRUPTED):
         raise typer.Exit(1)
 

@@ -154,9 +154,10 @@ class FlownRuns:
         lost = [c.run.name for c in cases if not self._files(place, c)]
         if lost:
             told = ", ".join(f"{k} = {v:.6g}" for k, v in cases[0].values.items())
+            law = "these gains" if cases[0].discon is None else "its DISCON.IN"
             raise DfsmError(
                 f"{place} lacks {len(lost)} of {len(cases)} runs ({', '.join(lost[:4])}"
-                f"{', …' if len(lost) > 4 else ''}): fly them with its DISCON.IN ({told}), put "
+                f"{', …' if len(lost) > 4 else ''}): fly them with {law} ({told}), put "
                 "them there under these names, and give the same command again"
             )
 
