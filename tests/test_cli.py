@@ -180,8 +180,8 @@ def test_names_cannot_break_the_config(here, dfsm, name):
     assert dfsm("init", "*.parquet", "-o", "c.yaml", "--quiet").code == 0
     assert parse_config(Path("c.yaml")).data.train == [file]
     assert list(YAML(typ="safe").load(Path("c.yaml"))) == [
-        *("data", "signals", "derivatives", "linear", "terms", "corrective"),
-        *("gate", "azimuth", "nonlinear_only", "refine", "seed"),
+        *("data", "signals", "inputs", "derivatives", "linear", "terms"),
+        *("corrective", "gate", "azimuth", "nonlinear_only", "refine", "seed"),
     ]
     assert names[0] == name
 

@@ -71,10 +71,10 @@ def test_units_that_differ_are_refused(linear_runs):
     odd = replace(
         linear_runs[1],
         channels=tuple(
-            replace(c, unit="ft/s") if c.name == "w" else c for c in linear_runs[1].channels
+            replace(c, unit="kN") if c.name == "w" else c for c in linear_runs[1].channels
         ),
     )
-    with pytest.raises(DfsmError, match=r"channel 'w' is in '(m/s|ft/s)' in .*csv but in '"):
+    with pytest.raises(DfsmError, match=r"channel 'w' is in '(m/s|kN)' in .*csv but in '"):
         fit([linear_runs[0], odd], LINEAR)
 
 

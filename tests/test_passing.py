@@ -218,6 +218,8 @@ def test_without_a_field_the_model_says_what_is_missing():
     assert power < 0.2
 
 
+# What the torque does to the speed here is noise, and told.
+@pytest.mark.filterwarnings("ignore:speed_dot")
 def test_what_reaches_into_the_band_without_the_field_is_told():
     # The torque shakes at 3P by much more than the tower does.
     shaken = []

@@ -22,6 +22,8 @@ from dfsm.fitting.residuals import Residuals, stacked
 # Share of a row that must be unexplained; how far apart the estimates must be, relative to the
 # larger one and in standard errors: see `benchmarks.feedback`.
 _UNEXPLAINED, _APART, _SURE = 0.3, 0.25, 3.0
+# Share of what is left over that the inputs' curvature may explain, judged on so many samples.
+_CURVED, _SAMPLES = 0.5, 4000
 # Orders of the series that are tried, rounds, and the change of coefficients that ends them.
 _ORDERS, _ROUNDS, _SETTLED = (1, 2, 3, 4, 6, 8, 12), 20, 1e-4
 
@@ -64,6 +66,11 @@ def pulled(residuals: Residuals, columns: Sequence[int]) -> list[Second]:
     X, y = stacked(centred.inputs), stacked(centred.targets)
     size = np.maximum(X.std(axis=0), np.finfo(float).tiny)
     first = np.linalg.lstsq(X / size, y, rcond=1e-10)[0] / size
+    # Not centred run by run: a parameter is constant within each.
+    whole = stacked(residuals.inputs)
+    whole = (whole - whole.mean(axis=0)) / np.maximum(whole.std(axis=0), np.finfo(float).tiny)
+    if _explained_by_curvature(whole, y - X @ first) > _CURVED:
+        return []
     second, errors = _whitened(centred, size, first)
     apart = np.abs(second - first)
     larger = np.maximum(np.abs(first), np.abs(second))
@@ -71,6 +78,20 @@ def pulled(residuals: Residuals, columns: Sequence[int]) -> list[Second]:
     return [
         Second(k, float(first[k]), float(second[k]), float(errors[k])) for k in columns if told[k]
     ]
+
+
+def _explained_by_curvature(inputs: Array, left: Array) -> float:
+    """Share of what is left over that products and cubes of the inputs explain.
+
+    What bends is a matter for corrective functions: it does follow from the inputs.
+    """
+    every = max(1, len(left) // _SAMPLES)
+    z, left = inputs[::every], left[::every]
+    first, second = np.triu_indices(z.shape[1])
+    bends = np.hstack([z[:, first] * z[:, second], z**3, z, np.ones((len(z), 1))])
+    rest = left - bends @ np.linalg.lstsq(bends, left, rcond=1e-10)[0]
+    usual = np.var(left) * len(left) / max(len(left) - bends.shape[1], 1)
+    return 1.0 - float(np.var(rest) / max(usual, np.finfo(float).tiny))
 
 
 def _whitened(centred: Residuals, size: Array, first: Array) -> tuple[Array, Array]:
