@@ -7,8 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from conftest import Dfsm
 from dfsm.data.readers import read
-from dfsm.errors import DfsmError
+from dfsm.data.readers.tables import write_table
+from dfsm.data.readers.uniform import UniformSettings, is_uniform, read_uniform
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.wind_field import with_field_wind
+from dfsm.errors import DfsmError, DfsmWarning
 
 TIME = 0.05 * np.arange(30)
 
@@ -180,3 +185,115 @@ def test_samples_of_bladed_that_do_not_fit(tmp_path):
     assert "signals at one time are announced" in sentence(path)
     path = tower(tmp_path, place=["AXIVAL 1.0 2.0"])
     assert "2 places on the axis 'Tower station height', but DIMENS announces 3" in sentence(path)
+
+
+# -- uniform winds ------------------------------------------------------------------------------
+
+HUB, RADIUS = 150.0, 120.0
+WIND = """! made by a test
+! Time  Speed  Dir  Vert  HShr  VShr  VLin  Gust   # more
+  0.0    8.0   0.0  0.0   0.0   0.2   0.0   0.0
+ 10.0   10.0  10.0  0.0   0.1   0.2   0.05  2.0   ! a gust
+ 10.0   12.0 350.0  0.0   0.1   0.0   0.05  0.0
+ 20.0   12.0 350.0  0.0   0.1   0.0   0.05  0.0
+"""
+
+
+def inflow(t: float, y: np.ndarray, z: np.ndarray, length: float = 240.0) -> np.ndarray:
+    """Wind along x of the file above before and behind its jump, formula by formula."""
+    part = min(max(t, 0.0), 10.0) / 10
+    speed, turn, power, gust = 8 + 2 * part, np.deg2rad(10 * part), 0.2, 2 * part
+    sideways, upwards = 0.1 * part, 0.05 * part
+    if t >= 10:
+        speed, turn, power, gust, sideways, upwards = 12.0, np.deg2rad(-10.0), 0.0, 0.0, 0.1, 0.05
+    shear = sideways * y * np.cos(turn) / length + upwards * (z - HUB) / length
+    return (speed * (z / HUB) ** power + speed * shear + gust) * np.cos(turn)
+
+
+def averages(t: float) -> list[float]:
+    """Mean over the disk and its slopes, by rings of points that stand for equal areas."""
+    r = RADIUS * np.sqrt((np.arange(200) + 0.5) / 200)[:, None]
+    angle = 2 * np.pi * np.arange(64) / 64
+    y, z = r * np.sin(angle), HUB + r * np.cos(angle)
+    u = inflow(t, y, z)
+    up, side = (z - HUB) / RADIUS, y / RADIUS
+    return [u.mean(), (u * up).mean() / (up**2).mean(), (u * side).mean() / (side**2).mean()]
+
+
+def a_run(stop: float = 30.0) -> Trajectory:
+    time = np.linspace(0.0, stop, 61)
+    return Trajectory(time, np.sin(time)[:, None], (Channel("q", "m"),), name="run")
+
+
+def test_a_uniform_wind_over_the_rotor(tmp_path):
+    path = tmp_path / "gust.wnd"
+    path.write_text(WIND)
+    with pytest.warns(DfsmWarning, match="blows up to 10 deg sideways: the signals hold what is"):
+        wind = read_uniform(path, UniformSettings(hub_height=HUB))
+    run = a_run()
+    wide = with_field_wind(run, wind.over(run.time, RADIUS), RADIUS, 1)
+    # Between lines, at the jump, and behind the last line.
+    for i, t in enumerate(run.time):
+        at = [wide[n][i] for n in ("RotWind", "RotShearV", "RotShearH")]
+        np.testing.assert_allclose(at, averages(t), atol=0.02)
+    # A ring of 15 m, where every part is nearly straight.
+    angle = 2 * np.pi * np.arange(64) / 64
+    u = inflow(7.5, 15 * np.sin(angle), HUB + 15 * np.cos(angle))
+    first = [u.mean(), 2 * (u * np.cos(angle)).mean(), 2 * (u * np.sin(angle)).mean()]
+    at = [wide[n][15] for n in ("U_r015", "C1_r015", "S1_r015")]
+    np.testing.assert_allclose(at, first, atol=2e-3)
+
+
+def test_uniform_winds_with_upflow_and_other_references(tmp_path):
+    path = tmp_path / "up.hh"
+    path.write_text("0,9,0,1.0,0,0,0.2,0,30\n")
+    settings = UniformSettings(hub_height=HUB, reference_height=100.0, reference_length=90.0)
+    with pytest.warns(DfsmWarning, match="blows upwards"):
+        wind = read_uniform(path, settings)
+    (u,) = wind.over(np.zeros(1), RADIUS).blocks()
+    at_hub = (9 * (1 + 0.2 * (HUB - 100) / 90)) * np.cos(np.pi / 6) - 0.5
+    np.testing.assert_allclose(u[0, 20], at_hub, rtol=1e-12)
+
+
+def test_the_command_takes_uniform_winds(tmp_path, dfsm: Dfsm):
+    path = tmp_path / "step.wnd"
+    path.write_text("0 8 0 0 0 0.2 0 0\n99 8 0 0 0 0.2 0 0\n")
+    write_table(a_run(), tmp_path / "run.csv")
+    command = ("wind", path, tmp_path / "run.csv", "--radius", RADIUS, "-o", tmp_path / "new")
+    assert "give its height with --hub-height" in dfsm(*command).sentence
+    command = (*command, "--hub-height", HUB, "--harmonics", 0)
+    assert "--shear is for a Mann box" in dfsm(*command, "--shear", 0.1).sentence
+    box = ("--box", 8, 8, 8, 1, 1, 1, "--reference-height", 90)
+    assert "--reference-height is for a uniform wind" in dfsm(*command, *box).sentence
+    result = dfsm(*command)
+    assert result.code == 0
+    assert "hub at 150 m, as told" in result.out
+    mean = averages(0.0)[0]  # the same wind
+    np.testing.assert_allclose(read(tmp_path / "new" / "run.parquet")["RotWind"], mean, atol=2e-3)
+    assert dfsm(*command, "--reference-height", 75).code == 0
+    written = read(tmp_path / "new" / "run.parquet")
+    np.testing.assert_allclose(written["RotWind"], mean * 2**0.2, atol=2e-3)
+    assert "of radius 120.0 m around a hub at 100 m" in dfsm(*command, "--hub-height", 100).sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("0 8 0 0 0 0.2\n", "6 columns, a uniform wind has 8 or 9 (time, speed, direction, "),
+        ("0 8 0 0 0 0.2 0 0\n1 8 0 0 0 0.2 0\n", "line 2: 7 values, but the header names 8"),
+        ("0 8 0 0 0 0.2 0 0\n1 8 0 x 0 0.2 0 0\n", "line 2: 'x' in column 4 is no number"),
+        ("0 8 0 0 0 0.2 0 0\n\n1 nan 0 0 0 0 0 0\n", "line 3: a value is missing or no wind"),
+        ("0 8 0 0 0 0.2 0 0\n1 8000 0 0 0 0 0 0\n", "speeds below 1000 m/s"),
+        ("5 8 0 0 0 0.2 0 0\n1 8 0 0 0 0 0 0\n", "line 2: its time 1 s comes after 5 s"),
+    ],
+)
+def test_uniform_winds_that_are_none(tmp_path, text, said):
+    path = tmp_path / "a.wnd"
+    path.write_text(text)
+    assert is_uniform(path)
+    with pytest.raises(DfsmError) as caught:
+        read_uniform(path, UniformSettings(hub_height=HUB))
+    assert said in str(caught.value)
+    with pytest.raises(DfsmError, match="reference_length is -1, expected a positive number in m"):
+        UniformSettings(hub_height=HUB, reference_length=-1)
+    assert not is_uniform(Path(__file__))

@@ -131,6 +131,7 @@ VALID = {
         "mean_wind": 8.0,
         "hub_height": 90.0,
     },
+    "UniformSettings": {"hub_height": 90.0},
     "RotorTable": {
         "pitch": np.arange(5.0),
         "tip_speed_ratio": _RATIOS,

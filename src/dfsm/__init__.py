@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from dfsm.data.readers.rotor_table import RotorTable, read_rotor_table
     from dfsm.data.readers.tables import write_table
     from dfsm.data.readers.turbsim import read_turbsim
+    from dfsm.data.readers.uniform import UniformSettings, read_uniform
     from dfsm.data.trajectory import Channel, Trajectory
     from dfsm.data.wind_field import with_field_wind, with_harmonics
     from dfsm.errors import DfsmError, DfsmWarning
@@ -111,6 +112,8 @@ _HOME = {
     "read_turbsim": "data.readers.turbsim",
     "read_mann": "data.readers.mann",
     "BoxSettings": "data.readers.mann",
+    "read_uniform": "data.readers.uniform",
+    "UniformSettings": "data.readers.uniform",
     "with_field_wind": "data.wind_field",
     "with_harmonics": "data.wind_field",
     "RotorTable": "data.readers.rotor_table",

@@ -19,15 +19,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.progress import track
-from dfsm.core.types import Array, IntArray
+from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory, labels
 from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.numerics.bilinear import bilinear_weights
 
 PLANE = ("RotWind", "RotShearV", "RotShearH")
 DISK = ("U_disk", "U_cubic")
@@ -85,6 +86,13 @@ class WindField(ABC):
     mean_wind: float
     periodic: bool
     delay: float
+    # Whether it was made with a mean and moves with it, so that the two must agree.
+    moves_with_mean: ClassVar[bool] = True
+
+    @property
+    def times(self) -> Array:
+        """Times in s of a run when the rotor meets the field's time steps, shape ``(time,)``."""
+        return self.step * np.arange(self.count) - self.delay
 
     @abstractmethod
     def blocks(self) -> Iterator[Array]:
@@ -171,7 +179,7 @@ def field_signals(
     if not 0 <= harmonics < _AROUND // 2:
         raise DfsmError(f"{harmonics} harmonics were asked for, expected 0 to {_AROUND // 2 - 1}")
     disk, plane = _plane(field, radius)
-    hub = _bilinear(field, np.zeros(1), np.full(1, field.hub_height)).T
+    hub = bilinear_weights(field.y, field.z, np.zeros(1), np.full(1, field.hub_height)).T
     names = [*PLANE]
     fourier = np.empty((len(hub), 0))
     if harmonics:
@@ -187,9 +195,9 @@ def field_signals(
         parts.append(np.concatenate([*columns, u @ hub], axis=1))
     channels = tuple(Channel(n, "m/s", role="disturbance") for n in (*names, "hub"))
     values = np.concatenate(parts)
-    _check_mean(field, float(values[:, 0].mean()))
-    time = field.step * np.arange(field.count) - field.delay
-    return Trajectory(time, values, channels, field.path.stem, str(field.path))
+    if field.moves_with_mean:
+        _check_mean(field, float(values[:, 0].mean()))
+    return Trajectory(field.times, values, channels, field.path.stem, str(field.path))
 
 
 def _check_mean(field: WindField, mean: float) -> None:
@@ -278,30 +286,11 @@ def _ring_weights(field: WindField, rings: Sequence[float], harmonics: int) -> A
     terms = [np.full(_AROUND, 1 / _AROUND)]
     for n in range(1, harmonics + 1):
         terms += [np.cos(n * angle) * 2 / _AROUND, np.sin(n * angle) * 2 / _AROUND]
-    weights = [
-        np.stack(terms) @ _bilinear(field, r * np.sin(angle), field.hub_height + r * np.cos(angle))
-        for r in rings
-    ]
+    weights = []
+    for r in rings:
+        y, z = r * np.sin(angle), field.hub_height + r * np.cos(angle)
+        weights.append(np.stack(terms) @ bilinear_weights(field.y, field.z, y, z))
     return np.concatenate(weights).T
-
-
-def _bilinear(field: WindField, y: Array, z: Array) -> Array:
-    """Weights ``(place, point)`` that interpolate in the grid at places inside it."""
-    weights = np.zeros((len(y), len(field.z), len(field.y)))
-    places = np.arange(len(y))
-    row, up = _cell(field.z, z)
-    column, side = _cell(field.y, y)
-    for i, part in ((0, 1 - up), (1, up)):
-        weights[places, row + i, column] = part * (1 - side)
-        weights[places, row + i, column + 1] = part * side
-    return weights.reshape(len(y), -1)
-
-
-def _cell(grid: Array, at: Array) -> tuple[IntArray, Array]:
-    """Which cell of an equidistant grid, and how far along it from 0 to 1."""
-    place = np.clip((at - grid[0]) / (grid[1] - grid[0]), 0, len(grid) - 1)
-    cell = np.minimum(place.astype(np.int64), len(grid) - 2)
-    return cell, place - cell
 
 
 # -- signals of a run ---------------------------------------------------------------------------
