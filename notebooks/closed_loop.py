@@ -59,7 +59,9 @@ loops = {
 }
 for gain, loop in loops.items():
     run = loop.trajectory
-    spread = {name: run[name].std().round(3) for name in ("GenSpeed", "BldPitch1", "PtfmPitch")}
+    spread = {
+        name: round(float(run[name].std()), 3) for name in ("GenSpeed", "BldPitch1", "PtfmPitch")
+    }
     print(f"kp {gain:g}: {loop.status.name.lower()}, standard deviations {spread}")
 
 # %% [markdown]

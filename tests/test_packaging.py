@@ -112,6 +112,13 @@ def test_contributing_names_files_that_exist():
     paths = re.findall(r"`((?:src|tests|docs|benchmarks)/[\w./]+)`", text)
     assert len(paths) > 8
     assert [p for p in paths if not (ROOT / p).exists()] == []
+    # What a table is called in the file that is named for it.
+    entries = re.findall(r"`(\w+)` in `([\w/]+/[\w.]+)`", text)
+    assert len(entries) > 5
+    for name, path in entries:
+        assert re.search(rf"^{name}\b", (ROOT / path).read_text(encoding="utf-8"), re.MULTILINE), (
+            name
+        )
     targets = re.findall(r"^    make (\w+)", text, re.MULTILINE)
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert [t for t in targets if f"\n{t}:" not in makefile] == []

@@ -87,6 +87,17 @@ def test_the_navigation_names_pages_that_exist_once_each():
     assert SITE.unlisted(nav, ["start.md", "new.md"]) == ["new.md"]
 
 
+def test_pages_that_the_code_names_exist():
+    code = [
+        p for folder in ("src", "benchmarks", "examples") for p in (ROOT / folder).rglob("*.py")
+    ]
+    named = {
+        n for p in code for n in re.findall(r"docs/[\w/-]+\.md", p.read_text(encoding="utf-8"))
+    }
+    assert "docs/how-to/problem.md" in named
+    assert {n for n in named if n not in PAGES} == set()
+
+
 # -- pages made of other files ------------------------------------------------------------------
 
 INIT = (ROOT / "src" / "dfsm" / "__init__.py").read_text(encoding="utf-8")
@@ -192,7 +203,7 @@ def test_the_five_minutes_begin_as_told(start, dfsm):
 def test_the_five_minutes_end_as_told(start, dfsm):
     blocks, quick = start
     for words in commands(PAGES["docs/start.md"]):
-        expanded = [str(p) for w in words for p in (sorted(Path().glob(w)) if "*" in w else [w])]
+        expanded = [str(p) for w in words for p in (sorted(Path().glob(w)) if "/*" in w else [w])]
         result = dfsm(*expanded)
         assert result.code == 0, result
         if words[0] == "init":

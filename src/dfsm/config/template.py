@@ -182,7 +182,7 @@ _HUB_HEIGHT = """\
 """
 
 _CORRECTION = """\
-  kind: mlp           # or rbf, rbf_incremental, gp, none; docs/method.md lists their keys
+  kind: mlp           # trains for minutes, rbf for seconds; or rbf_incremental, gp, none
   hidden: [20, 20]    # units per layer"""
 
 _NO_CORRECTION = """\
