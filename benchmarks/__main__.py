@@ -1,11 +1,12 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-    [unseen] [limits] [matched] [control] [codesign] [loops] [tuning] [exports] [peer] [dymos]
-    [gpu] [fuzz] [kill] [feedback]
+    [unseen] [limits] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid] [peer]
+    [dymos] [gpu] [fuzz] [kill] [feedback]
 
-Without names all but `peer` and `dymos`, which make environments of their own and install
-jax-sysid and dymos there, and `fuzz` and `kill`, which damage inputs and end commands for hours
+Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER`` for published
+records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
+there, and `fuzz` and `kill`, which damage inputs and end commands for hours
 (``fuzz --inputs 20000``).
 ``[startup] [--before COMMIT]`` measures cold processes, of an earlier build beside this one.
 """
@@ -43,6 +44,7 @@ from benchmarks import (
     scaling,
     speed,
     startup,
+    sysid,
     tuning,
     unseen,
 )
@@ -66,6 +68,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "loops": loops.run,
     "tuning": tuning.run,
     "exports": exports.run,
+    "sysid": sysid.run,
     "peer": peer.run,
     "dymos": dymos_peer.run,
     "gpu": gpu.run,
@@ -73,7 +76,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "kill": kill.run,
 }
 # Run where they are named alone.
-NAMED = ("peer", "dymos", "fuzz", "kill")
+NAMED = ("sysid", "peer", "dymos", "fuzz", "kill")
 
 
 def main() -> None:
@@ -82,6 +85,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--inputs", type=int, default=20_000, help="of fuzz")
     parser.add_argument("--before", metavar="COMMIT", help="of startup: an earlier build")
+    parser.add_argument("--data", help="folder with the published records of sysid")
     parser.add_argument("--seed", type=int, default=0, help="of fuzz")
     arguments = parser.parse_args()
     names = arguments.parts or [n for n in PARTS if n not in NAMED]
@@ -95,7 +99,11 @@ def main() -> None:
     }
     warnings.simplefilter("ignore", dfsm.DfsmWarning)
     for name in names:
-        told = {"fuzz": (arguments.inputs, arguments.seed), "startup": (arguments.before,)}
+        told = {
+            "fuzz": (arguments.inputs, arguments.seed),
+            "startup": (arguments.before,),
+            "sysid": (arguments.data,),
+        }
         figures[name] = PARTS[name](*told.get(name, ()))
         if name == "startup":
             print("\n".join(startup.startup_table(figures[name])), file=sys.stderr)

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from dfsm.fitting.corrective.perceptron import MLP
     from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
     from dfsm.fitting.fit import FitResult, fit
+    from dfsm.fitting.hidden.settings import HiddenSettings
     from dfsm.fitting.linear import LPV, LTI
     from dfsm.fitting.settings import FitSettings
     from dfsm.loops.adaptive import AdaptiveResult, AdaptiveSettings, optimize_adaptively
@@ -163,6 +164,7 @@ _HOME = {
     "FitSettings": "fitting.settings",
     "FitResult": "fitting.fit",
     "fit": "fitting.fit",
+    "HiddenSettings": "fitting.hidden.settings",
     "RefineSettings": "refinement.settings",
     "RefineResult": "refinement.refine",
     "refine": "refinement.refine",

@@ -23,6 +23,7 @@ from dfsm.data.suspects import Suspects
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
+from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
@@ -143,6 +144,7 @@ class Config(Strict):
     inputs: Between | dict[str, Between] | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
     refine: RefineSettings | None = None
+    hidden: HiddenSettings | None = None
     seed: int = FitSettings.seed
     compare: CompareConfig = CompareConfig()
     _folder: Path = PrivateAttr(default=Path())
@@ -176,6 +178,7 @@ class Config(Strict):
             inputs=self.inputs,
             nonlinear_only=self.nonlinear_only,
             seed=self.seed,
+            hidden=self.hidden,
         )
 
     @property

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.config.causes import driven_by_past
 from dfsm.core.types import Array
 from dfsm.data.between import recognised
 from dfsm.data.derivatives import per_second
@@ -32,6 +33,8 @@ _TURBINE = {*_SECOND_ORDER, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
 _IS_RATE, _SLOPE = 0.9, 0.1
 # Share of a derivative's variance that others must explain in a state, and of its own in an output.
 _STATE, _OUTPUT = 0.6, 0.95
+# Explained by less, a state is not to be told by derivatives alone.
+_CLEAR = 0.95
 _MOST_SAMPLES, _MOST_CHANNELS = 4000, 60
 
 
@@ -55,6 +58,8 @@ class Proposal:
         Whether the channels are those of a wind turbine.
     held
         Controls and disturbances that stay and jump, and so are held between samples.
+    hidden
+        Whether what is measured has states beside it that nobody measures.
     """
 
     states: list[dict[str, Any]]
@@ -67,6 +72,7 @@ class Proposal:
     wind: str | None = None
     turbine: bool = False
     held: tuple[str, ...] = ()
+    hidden: bool = False
 
 
 def propose(
@@ -92,7 +98,8 @@ def propose(
     else:
         reasons |= dict.fromkeys(held, "control: it stays and jumps, as what is held does")
         proposed = _of_anything(runs[0], varying, list(parameters), rates, reasons)
-        names = [n for n in varying if n in {*held, *proposed.controls}]
+        states = {s["name"] for s in proposed.states} if proposed.hidden else set()
+        names = [n for n in varying if n in {*held, *proposed.controls} - states]
         proposed = replace(proposed, controls=names)
     driving = {*proposed.controls, *proposed.disturbances}
     return replace(proposed, held=tuple(n for n in held if n in driving))
@@ -138,6 +145,7 @@ def _of_anything(
     reasons: dict[str, str],
 ) -> Proposal:
     states, outputs, controls, disturbances = [], [], [], []
+    shares: list[float] = []
     names = [n for n in varying if n not in rates]
     if len(names) > _MOST_CHANNELS:
         return Proposal([], [], [], parameters, [], [], reasons)
@@ -153,9 +161,11 @@ def _of_anything(
         twice = _explained(second[:, i], np.column_stack([table, first[:, i]]))
         if known or (twice >= _STATE and twice > once):
             states.append(_second_order(name, rates))
+            shares.append(twice)
             reasons[name] = "state of order 2: its second derivative follows from it and the others"
         elif once >= _STATE:
             states.append({"name": name, "order": 1})
+            shares.append(once)
             reasons[name] = "state: its rate follows from it and the others"
         elif others.shape[1] and _explained(table[:, i], others) >= _OUTPUT:
             outputs.append(name)
@@ -166,7 +176,32 @@ def _of_anything(
         else:
             disturbances.append(name)
             reasons[name] = "disturbance (or control): nothing recorded explains it"
+    unclear = not shares or min(shares) < _CLEAR or not (controls or disturbances)
+    if not rates and unclear and (driven := driven_by_past(run, names)):
+        return _with_hidden(run, names, driven, parameters, reasons)
     return Proposal(states, controls, disturbances, parameters, outputs, [], reasons)
+
+
+def _with_hidden(
+    run: Trajectory,
+    names: Sequence[str],
+    driven: Sequence[str],
+    parameters: list[str],
+    reasons: dict[str, str],
+) -> Proposal:
+    """Roles where derivatives do not tell: what the past of others drives, and these others."""
+    controls, disturbances = [], []
+    for name in names:
+        if name in driven:
+            reasons[name] = "state, with hidden ones beside it: the past of the others drives it"
+        elif np.mean(np.diff(run[name]) == 0) > 1 / 2:
+            controls.append(name)
+            reasons[name] = "control: it stays and jumps, and no past of the others explains it"
+        else:
+            disturbances.append(name)
+            reasons[name] = "disturbance (or control): no past of the others explains it"
+    states = [{"name": name, "order": 1} for name in driven]
+    return Proposal(states, controls, disturbances, parameters, [], [], reasons, hidden=True)
 
 
 def _second_order(name: str, rates: Mapping[str, str]) -> dict[str, Any]:

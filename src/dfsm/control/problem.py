@@ -27,7 +27,8 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import latent_state, latents_at, poles
+from dfsm.models.latents import latents_at, poles
+from dfsm.simulation.hidden import latents_from_past
 from dfsm.simulators import ODESystem
 
 
@@ -190,9 +191,10 @@ class OptimalControlProblem:
         """Latent states at the first time by name, one per scenario; None where that is free."""
         if not isinstance(self.model, DFSM) or not self.latents:
             return {}
-        driving = self.model.signals.driving
+        signals = self.model.signals
+        driving = (*signals.driving, *(signals.measured if signals.startup else ()))
         known = [
-            latent_state(self.model, run, self.start)
+            latents_from_past(self.model, run, self.start)
             if run is not None and all(n in run for n in driving)
             else None
             for run in self.scenarios
@@ -215,6 +217,8 @@ class OptimalControlProblem:
             problem bounds is missing.
         """
         if not isinstance(self.model, DFSM) or self.free_time is not None:
+            return {}
+        if self.model.signals.startup:
             return {}
         chosen = np.asarray(poles(self.model).drive)[:, : len(self.plant.names("controls"))]
         asked = {*self.bounds, *self.final}

@@ -31,6 +31,7 @@ from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
 from dfsm.fitting.gate import correct, predicted
+from dfsm.fitting.hidden.build import fit_hidden, require_hidden
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.over_intervals import over_intervals
@@ -109,6 +110,9 @@ def fit(
         a response, a gap in a record, a parameter with one value in all runs.
     """
     seconds: dict[str, float] = {}
+    hidden = settings.hidden
+    if hidden is not None:
+        require_hidden(settings, refinement is not None)
     with _timed(seconds, "select"):
         data = select(runs, settings)
     with _timed(seconds, "derivatives"):
@@ -120,7 +124,7 @@ def fit(
         residuals = rows.derivatives - predicted(f.model, rows.linear_inputs)
         doubt = doubts(rows, f, residuals, settings, intervals=rows is not samples)
     with _timed(seconds, "corrective functions"):
-        later = refinement is not None and refinement.network > 0
+        later = hidden is not None or (refinement is not None and refinement.network > 0)
         e = correct(rows, rows.linear_inputs, rows.derivatives, f, settings, later)
     region = region_of(samples, f.model, data)
     model = DFSM(
@@ -138,6 +142,14 @@ def fit(
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     recorded = seen = samples
     discarded: list[str] = []
+    learned: list[str] = []
+    if hidden is not None:
+        with _timed(seconds, "hidden states"):
+            found = fit_hidden(model, data, settings, hidden)
+            model, doubt = found.model, replace(doubt, notes=tuple(found.notes), outdated=True)
+            learned = found.checks
+            recorded = with_latents(model, data, samples, settings)
+            seen = along_rollouts(model, data, recorded, settings)
     if refinement is not None:
         with _timed(seconds, "refinement"):
             window = {"start": settings.start, "stop": settings.stop}
@@ -173,9 +185,13 @@ def fit(
         notes += more
     known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
     notes = list(dict.fromkeys(known))
-    checks = [*_inputs_told(samples, settings), *f.notes, *checks]
+    checks = [*_inputs_told(samples, settings), *f.notes, *learned, *checks]
     nonlinear = None
-    if settings.nonlinear_only and not isinstance(settings.corrective, NoCorrection):
+    if (
+        settings.nonlinear_only
+        and hidden is None
+        and not isinstance(settings.corrective, NoCorrection)
+    ):
         with _timed(seconds, "nonlinear-only"):
             nonlinear = _fit_nonlinear(samples, rows, region, settings)
             if nonlinear.signals.field:

@@ -15,7 +15,7 @@ from dfsm.errors import hushed
 from dfsm.fitting.samples import Samples, known_from
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import latent_path
+from dfsm.simulation.hidden import latents_along
 from dfsm.simulation.simulate import Status, simulate
 
 
@@ -26,7 +26,7 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSett
     paths = []
     for run in data:
         inside = np.isin(run.time, run.window(known_from(run, settings), settings.stop).time)
-        paths.append(latent_path(model, run)[inside])
+        paths.append(latents_along(model, run)[inside])
     at = model.signals.observed_columns.stop
     inputs = np.insert(samples.inputs, [at] * len(model.signals.latents), np.concatenate(paths), 1)
     return replace(samples, inputs=inputs, signals=model.signals)

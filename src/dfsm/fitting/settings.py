@@ -15,6 +15,7 @@ from dfsm.data.trajectory import Role
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
 from dfsm.fitting.corrective.perceptron import MLP
+from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.models.signals import Azimuth
 from dfsm.models.terms import TermSettings
@@ -67,6 +68,8 @@ class FitSettings:
     outliers
         What to do with stray samples and runs in another unit: ``"refuse"``, ``"drop"`` or
         ``"keep"``, see `dfsm.data.suspects.screened`.
+    hidden
+        Hidden states beside the measured ones, all of them learned on rollouts; None for none.
     """
 
     states: tuple[StateSpec, ...]
@@ -89,6 +92,7 @@ class FitSettings:
     nonlinear_only: bool = True
     seed: int = 0
     outliers: Suspects = "refuse"
+    hidden: HiddenSettings | None = None
 
     def __post_init__(self) -> None:
         known = f"one of {', '.join(SUSPECTS)}"

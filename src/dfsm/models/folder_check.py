@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from dfsm.data.derivatives import state_names
-from dfsm.models.corrective import Corrective, GaussianUnits, Perceptron
+from dfsm.models.corrective import Corrective, GaussianUnits, Perceptron, Polynomial
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.passing import FACTORS, harmonics_of
@@ -153,6 +153,8 @@ def _check_corrective(
         units = form.centres.shape[-1] if form.centres.ndim else 0
         expected |= {"centres": (inputs, units), "weights": (len(rows), units)}
         expected["bias"] = (len(rows),)
+    if isinstance(form, Polynomial):
+        expected["weights"] = (len(rows), len(form.factors))
     _shapes(what, expected, form)
     if isinstance(form, Perceptron):
         if not form.weights:

@@ -149,7 +149,7 @@ def as_states(pairs: jax.Array) -> jax.Array:
 def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
     """Input vectors ``(..., input)`` with the latent states that their own inputs lead to."""
     s = model.signals
-    if not s.latents:
+    if not s.latents or s.startup:
         return inputs
     dynamics = poles(model)
     force = inputs[..., s.order.driving_columns] @ dynamics.drive.T + dynamics.offset
@@ -317,6 +317,11 @@ def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
     s = model.signals
     region = _with_range(model.region, s.latent_columns, paths)
     return replace(model, region=replace(region, operating=at_rest(model, region.operating)))
+
+
+def with_columns(region: Region, at: int, values: Array) -> Region:
+    """The region of more inputs, from column `at` on, of which there are samples ``(time, n)``."""
+    return _with_range(region, slice(at, at), [values])
 
 
 def _with_range(region: Region, gone: slice, paths: Sequence[Array]) -> Region:

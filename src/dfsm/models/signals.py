@@ -125,6 +125,11 @@ class SignalTable:
     between
         What controls and disturbances, in this order, do between samples, see `data.between`;
         empty for lines.
+    startup
+        Length in s of the record from which hidden states are told, see `simulation.hidden`; 0
+        where latent states follow from the inputs alone, see `latents.py`.
+    step
+        In s, of the integration that the model was fitted with; None for one fitted on derivatives.
     specs
         Which states are measured and which are their rates, see `StateSpec`.
     derivatives
@@ -151,6 +156,8 @@ class SignalTable:
     latents: tuple[Channel, ...] = ()
     field: tuple[Channel, ...] = ()
     between: tuple[Between, ...] = ()
+    startup: float = 0.0
+    step: float | None = None
 
     @property
     def inputs(self) -> tuple[Channel, ...]:

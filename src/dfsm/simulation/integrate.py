@@ -32,6 +32,7 @@ __all__ = [
     "pieces_of",
     "rk4",
     "stages",
+    "stages_of",
     "stepped",
 ]
 
@@ -161,6 +162,28 @@ def mesh_of(driven: Trajectory, step: float | None, between: Between | Sequence[
         )
     every = max(1, int(np.ceil(parts)))
     return Mesh(driven.time, driven.values, each(driven, between), every)
+
+
+def stages_of(driven: Trajectory, between: Sequence[Between], every: int) -> tuple[Array, ...]:
+    """Inputs at the start, the middle and the end of `every` steps per interval.
+
+    Parameters
+    ----------
+    driven, between
+        As for `mesh_of`.
+    every
+        Steps per interval.
+
+    Returns
+    -------
+    tuple of ndarray
+        Three of shape ``(interval, every, exogenous)``.
+    """
+    d, c, b, a = polynomials(driven.time, driven.values, each(driven, between))[:, :, None]
+    step = np.diff(driven.time)[:, None, None] / every
+    begin = step * np.arange(every)[:, None]
+    times = (begin, begin + step / 2, begin + step)
+    return tuple(a + t * (b + t * (c + t * d)) for t in times)
 
 
 # -- fixed steps --------------------------------------------------------------------------------

@@ -24,12 +24,12 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, printable
 from dfsm.models.completion import all_completed, completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import latent_state
 from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import require_constant, require_field
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.fastest import REACH, fastest_rates
+from dfsm.simulation.hidden import latents_from_past, told_state
 from dfsm.simulation.integrate import (
     Case,
     Drive,
@@ -240,9 +240,13 @@ def simulate(
 
     def case(i: int, drive: Drive) -> Case[Drive]:
         begins = float(driven[i].time[0])
-        x0 = _observed_state(model, batch[i], begins) if starts is None else starts[i]
+        if starts is not None:
+            x0 = starts[i]
+        else:
+            told = model.signals.startup
+            x0 = (told_state if told else _observed_state)(model, batch[i], begins)
         if len(x0) < len(model.signals.states):
-            x0 = np.concatenate([x0, latent_state(model, batch[i], begins)])
+            x0 = np.concatenate([x0, latents_from_past(model, batch[i], begins)])
         return Case(drive, x0, initial_azimuth(model, batch[i], begins), fields[i].values)
 
     def judged(i: int, rollout: Rollout) -> Simulation:
@@ -288,6 +292,12 @@ def _steppings(
     """Steps that RK4 can take with this model; very many of them are left to a stiff method."""
     if settings.method != "rk4":
         return [_Stepping(settings.method, settings.step)] * len(driven)
+    asked, own = settings.step, model.signals.step
+    if asked is not None and own is not None and asked > own * (1 + 1e-6):
+        told = f"integrated in steps of {asked:g} s, but the model was made for steps of {own:g} s"
+        note = f"{told}: its errors are not those of the fit"
+        return [_Stepping("rk4", asked, note)] * len(driven)
+    settings = replace(settings, step=own if asked is None else asked)
     rates = fastest_rates(model, [run.values for run in driven])
     return [_stepping(run, rate, settings) for run, rate in zip(driven, rates, strict=True)]
 
@@ -324,7 +334,9 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
         Shape ``(state,)``.
     """
     run = completed(run, model.signals)
-    latent = latent_state(model, run, start)
+    if model.signals.startup:
+        return told_state(model, run, start)
+    latent = latents_from_past(model, run, start)
     return np.concatenate([_observed_state(model, run, start), latent])
 
 

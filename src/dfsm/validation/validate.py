@@ -20,12 +20,12 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import latent_path
 from dfsm.models.recorded import Recorded, recorded_states
 from dfsm.models.signals import Azimuth, radians_per_second
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
 from dfsm.numerics.spectra import Band, spectrum
 from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
+from dfsm.simulation.hidden import latents_along
 from dfsm.simulation.simulate import Simulation, SimulationSettings, Status, simulate
 from dfsm.validation.intervals import Intervals
 from dfsm.validation.results import (
@@ -228,7 +228,7 @@ def _derivative_errors(
     else:
         inside = seen.trajectory.window(time[0], time[-1])
         states = inside.select(c.name for c in s.observed).values
-        x = np.concatenate([states, latent_path(model, run)[np.isin(run.time, time)]], axis=1)
+        x = np.concatenate([states, latents_along(model, run)[np.isin(run.time, time)]], axis=1)
         exogenous = [inside.select(s.names(g)).values for g in _EXOGENOUS]
         extracted = seen.found.derivatives[rows]
         weights = weights_over_time([inside.time])

@@ -1,0 +1,103 @@
+"""Published system identification benchmarks, and twins of our own: errors of free runs.
+
+python -m benchmarks sysid --data FOLDER     records as docs/hidden-states.md says where to get them
+python -m benchmarks sysid                   twins, whose structure is the same
+
+Each by one call on the configuration that `dfsm init` proposes; the first 50 samples of a test
+record tell the state and are not scored.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time as clock
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.twins import TWINS
+from dfsm.config.fit import load_config
+from dfsm.config.template import write_config
+from dfsm.data.readers import read
+from dfsm.data.readers.tables import write_table
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
+from dfsm.fitting.fit import fit
+from dfsm.simulation.simulate import simulate
+
+# Files by record: what trains, and what tests, with the unit and the factor to it.
+PUBLISHED: Mapping[str, tuple[str, Sequence[str], str, float]] = {
+    "cascaded tanks": ("cascaded_tanks_train.csv", ("cascaded_tanks_test.csv",), "V", 1.0),
+    "silverbox": (
+        "silverbox_train.parquet",
+        ("silverbox_test.parquet", "silverbox_arrow.parquet"),
+        "mV",
+        1e3,
+    ),
+}
+SEEDS = (0, 1, 2, 3, 4)
+_TOLD = 50
+_TRAIN, _TEST = 1200, 800
+
+
+def run(folder: str | None = None, seeds: Iterable[int] = SEEDS) -> list[dict[str, object]]:
+    """One row per record and seed: errors of free runs, seconds, what was chosen."""
+    seeds = tuple(seeds)
+    if folder is not None:
+        return _published(Path(folder), seeds)
+    rows = []
+    with tempfile.TemporaryDirectory() as place:
+        for name, twin in TWINS.items():
+            train = Path(place) / f"{name}.csv"
+            write_table(twin.record(_TRAIN, 1), train)
+            tests = {"test": twin.record(_TEST, 2)}
+            rows += [_row(name, train, tests, (twin.unit, 1.0), seed) for seed in seeds]
+    return rows
+
+
+def _published(folder: Path, seeds: Sequence[int]) -> list[dict[str, object]]:
+    rows = []
+    for name, (train, tests, unit, factor) in PUBLISHED.items():
+        missing = [f for f in (train, *tests) if not (folder / f).exists()]
+        if missing:
+            raise DfsmError(
+                f"{folder} lacks {missing[0]}: a table with columns Time, u and y, as "
+                "docs/hidden-states.md describes it"
+            )
+        records = {Path(f).stem: read(folder / f) for f in tests}
+        rows += [_row(name, folder / train, records, (unit, factor), seed) for seed in seeds]
+    return rows
+
+
+def _row(
+    name: str, train: Path, tests: Mapping[str, Trajectory], unit: tuple[str, float], seed: int
+) -> dict[str, object]:
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "config.yaml"
+        write_config([str(train)], path)
+        config, runs = load_config(path)
+    config = config.model_copy(update={"seed": seed})
+    began = clock.perf_counter()
+    model = fit(runs, config.fit_settings(), config.refine).model
+    seconds = clock.perf_counter() - began
+    errors = {}
+    for test, record in tests.items():
+        rollout = simulate(model, record, start=float(record.time[_TOLD])).trajectory
+        if len(rollout) < len(record) - _TOLD:
+            errors[test] = None
+            continue
+        apart = rollout["y"] - record["y"][_TOLD:]
+        errors[test] = unit[1] * float(np.sqrt(np.mean(apart**2)))
+    told = model.provenance.record.get("hidden", {})
+    return {
+        "record": name,
+        "seed": seed,
+        "unit": unit[0],
+        "rmse": errors,
+        "seconds": seconds,
+        "hidden": told.get("count"),
+        "form": told.get("form"),
+        "inputs": model.signals.between,
+        "step_s": told.get("step"),
+    }

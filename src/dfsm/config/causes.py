@@ -1,0 +1,59 @@
+"""Which recorded channels are driven by the past of others, and which drive.
+
+Granger 1969, "Investigating causal relations by econometric models and cross-spectral methods": a
+channel is driven where the past of the others, beside its own, makes its next sample much better
+known. An input of an open loop, however smooth, is not; a hidden state in between does not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+
+# Samples of the past, samples looked at, and channels beyond which it is not tried.
+_PAST, _MOST_SAMPLES, _MOST_CHANNELS = 10, 20_000, 12
+# F statistic from which the past of others counts, and the share of what it tells of the channel
+# that it tells most of: the past of a response tells a little of a smooth input, too.
+_COUNTS, _SHARE = 4.0, 0.25
+
+
+def driven_by_past(run: Trajectory, names: Sequence[str]) -> list[str]:
+    """Channels that others drive; empty where nothing tells them from those that drive.
+
+    Parameters
+    ----------
+    run
+        One record.
+    names
+        Its channels that may be either.
+    """
+    table = np.nan_to_num(run.select(names).values[:_MOST_SAMPLES])
+    past = min(_PAST, len(table) // (10 * max(1, len(names))))
+    if not 2 <= len(names) <= _MOST_CHANNELS or past < 2:
+        return []
+    table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), np.finfo(float).tiny)
+    lags = np.stack([table[past - k - 1 : len(table) - k - 1] for k in range(past)], axis=1)
+    gains = np.array([_gain(lags, table[past:], i) for i in range(len(names))])
+    counted = gains * (len(lags) - past * len(names)) / (past * (len(names) - 1)) > _COUNTS
+    driven = counted & (gains >= _SHARE * gains.max())
+    if not driven.any() or driven.all():
+        return []
+    return [name for name, is_driven in zip(names, driven, strict=True) if is_driven]
+
+
+def _gain(lags: Array, now: Array, column: int) -> float:
+    """By how much its own past alone leaves more of a channel than with the past of the others."""
+    own = _left(lags[:, :, [column]].reshape(len(lags), -1), now[:, column])
+    every = _left(lags.reshape(len(lags), -1), now[:, column])
+    return own / every - 1
+
+
+def _left(past: Array, now: Array) -> float:
+    """Mean square that a linear fit leaves, per degree of freedom; rounding is no gain."""
+    coefficients = np.linalg.lstsq(past, now, rcond=1e-10)[0]
+    rest = now - past @ coefficients
+    return float(rest @ rest) / max(1, len(now) - past.shape[1]) + 1e-14

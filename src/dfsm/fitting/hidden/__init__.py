@@ -1,0 +1,1 @@
+"""Models with hidden states, fitted on what they give: rollouts against records."""

@@ -1,0 +1,283 @@
+"""From runs to a model with hidden states that is simulated like any other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.types import Array, IntArray
+from dfsm.data.dataset import Dataset
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.errors import DfsmError
+from dfsm.fitting.hidden.error import HiddenError
+from dfsm.fitting.hidden.form import Form
+from dfsm.fitting.hidden.search import Found, search
+from dfsm.fitting.hidden.settings import HiddenSettings
+from dfsm.fitting.settings import FitSettings
+from dfsm.models.corrective import Corrective, Perceptron, Polynomial
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import with_columns
+from dfsm.models.linear import LinearModel
+from dfsm.models.signals import Provenance
+
+# Samples of the past from which hidden states are told, and fewest samples per parameter.
+_STARTUP, _FEWEST = 50, 20
+# A measured state that is another one late, to so small a share of its variance.
+_DELAYED, _LAGS = 1e-6, 50
+# Of what a further hidden state must gain to be no more than the data can tell.
+_NOTHING = 0.98
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A model with hidden states, and what is to be told of it."""
+
+    model: DFSM
+    notes: list[str]
+    checks: list[str]
+
+
+def require_hidden(settings: FitSettings, refined: bool) -> None:
+    """Refuse settings that hidden states do not go with."""
+    for spec in settings.states:
+        if spec.order != 1 or spec.rate is not None:
+            raise DfsmError(
+                f"state '{spec.name}' of order {spec.order} with hidden: hidden states are what a "
+                f"rate is, so name it as {{name: {spec.name}, order: 1}} alone, or leave hidden out"
+            )
+    if not settings.states:
+        raise DfsmError("hidden needs a measured state: name in signals.states what is measured")
+    if refined:
+        raise DfsmError("hidden fits rollouts already: leave refine out, or hidden")
+    if settings.linear.kind != "LTI" or settings.terms or settings.azimuth is not None:
+        raise DfsmError(
+            "hidden goes with linear.kind LTI, without terms and azimuth: leave out these or hidden"
+        )
+
+
+def fit_hidden(model: DFSM, data: Dataset, settings: FitSettings, hidden: HiddenSettings) -> Hidden:
+    """Fit hidden states, and corrections of all rows, on rollouts.
+
+    Parameters
+    ----------
+    model
+        Fitted on derivatives: its signals and its region.
+    data
+        Training runs.
+    settings
+        Of the fit.
+    hidden
+        How.
+
+    Raises
+    ------
+    DfsmError
+        Records too short for what is asked for, or a measured state that is another one late.
+    """
+    s = model.signals
+    names = (*s.names("states"), *s.exogenous)
+    records = [r.window(settings.start, settings.stop).select(names) for r in data]
+    for record in records:
+        _require_apart(record, s.names("states"))
+    startup = _startup(records, hidden)
+    _require_enough(records, len(s.states), len(s.exogenous), hidden)
+    chosen = settings.inputs or {}
+    free = [
+        not isinstance(chosen, str) and n not in chosen and kind != "hold" and n in s.driving
+        for n, kind in zip(s.exogenous, s.between_samples(), strict=True)
+    ]
+    found = search(records, len(s.states), s.between_samples(), free, hidden, settings.seed)
+    built = _built(model, found, startup)
+    notes, checks = _told(found, hidden, [n for n, f in zip(s.exogenous, free, strict=True) if f])
+    record = {
+        "hidden": {
+            "count": found.best.form.states - found.best.form.outputs,
+            "form": found.best.form.kind,
+            "left_out": _root(found.best.error),
+            "by_count": {str(k): _root(v) for k, v in found.gains.items()},
+            "tried": [{"form": f, "count": c, "left_out": _root(e)} for f, c, e in found.tried],
+            "inputs": {k: _root(v) for k, v in found.kinds_tried.items()},
+            "step": built.signals.step,
+            "startup": startup,
+        }
+    }
+    return Hidden(replace(built, provenance=Provenance(record)), notes, checks)
+
+
+def _root(error: float) -> float | None:
+    return float(np.sqrt(error)) if np.isfinite(error) else None
+
+
+# -- bad input ----------------------------------------------------------------------------------
+
+
+def _startup(records: list[Trajectory], hidden: HiddenSettings) -> float:
+    """Length in s of the past that tells hidden states in use."""
+    step = float(np.median(np.concatenate([np.diff(r.time) for r in records])))
+    shortest = min(records, key=lambda r: r.duration)
+    if hidden.startup is None:
+        return min(_STARTUP * step, shortest.duration / 2)
+    if hidden.startup > shortest.duration:
+        raise DfsmError(
+            f"hidden.startup is {hidden.startup:g} s, but {shortest.where} lasts "
+            f"{shortest.duration:g} s: choose a shorter one, or leave the run out"
+        )
+    return hidden.startup
+
+
+def _require_enough(
+    records: list[Trajectory], outputs: int, inputs: int, hidden: HiddenSettings
+) -> None:
+    samples = sum(len(r) for r in records) * outputs
+    count = hidden.count or 0
+    parameters = (outputs + count) * (outputs + count + inputs + 1)
+    if samples < 2 * parameters or samples < _FEWEST:
+        raise DfsmError(
+            f"the runs hold {samples} measured values, too few for the {parameters} coefficients "
+            f"of a linear model with {count} hidden states: use more data, or fewer of them"
+        )
+
+
+def _require_apart(record: Trajectory, names: tuple[str, ...]) -> None:
+    """Refuse a measured state that is another one some samples ago."""
+    for late in names:
+        for early in names:
+            if late == early:
+                continue
+            y, x = record[late], record[early]
+            for k in range(min(_LAGS, len(y) // 4)):
+                apart = y[k:] - x[: len(x) - k]
+                if np.var(apart) <= _DELAYED * min(np.var(x), np.var(y)):
+                    seconds = float(record.time[k] - record.time[0])
+                    raise DfsmError(
+                        f"{record.where}: '{late}' is '{early}' {seconds:g} s later and tells "
+                        f"nothing else: leave '{late}' out of signals.states"
+                    )
+
+
+# -- the model ----------------------------------------------------------------------------------
+
+
+def _built(model: DFSM, found: Found, startup: float) -> DFSM:
+    s, form = model.signals, found.best.form
+    count = form.states - form.outputs
+    hidden = tuple(Channel(f"hidden{k + 1}", "-") for k in range(count))
+    table = replace(
+        s,
+        states=(*s.states, *hidden),
+        latents=hidden,
+        between=found.kinds[: len(s.driving)],
+        startup=startup,
+        step=found.standard.step / found.steps,
+    )
+    names = [c.name for c in table.inputs]
+    places = np.array([names.index(n) for n in (*table.names("states"), *s.exogenous)])
+    f, e = _equation(found, places)
+    paths = HiddenError(form, found.windows).paths(found.best.weights)
+    seen = paths[found.windows.used > 0][:, form.outputs :]
+    region = with_columns(model.region, s.state_columns.stop, seen)
+    return replace(
+        model,
+        f=f,
+        e=e,
+        region=region,
+        corrected=() if e is None else tuple(range(form.states)),
+        signals=table,
+    )
+
+
+def _equation(found: Found, places: IntArray) -> tuple[LinearModel, Corrective | None]:
+    """Linear and corrective part in physical units, inputs in the order of a model."""
+    form, standard = found.best.form, found.standard
+    none = np.zeros(form.states - form.outputs)
+    mean_x, scale_x = (
+        np.concatenate([a, none + b]) for a, b in zip(standard.outputs, (0, 1), strict=True)
+    )
+    mean = np.concatenate([mean_x, standard.inputs[0]])
+    scale = np.concatenate([scale_x, standard.inputs[1]])
+    rate = scale_x / standard.step
+    L, *others = map(np.asarray, form.parts(found.best.parameters))
+    slopes = rate[:, None] * L[:, :-1] / scale
+    coefficients = np.zeros_like(slopes)
+    coefficients[:, places] = slopes
+    offsets = rate * L[:, -1] - slopes @ mean
+    f = LinearModel(jnp.zeros(1), jnp.asarray(coefficients)[None], jnp.asarray(offsets)[None], None)
+    shift, spread = np.zeros(len(places)), np.ones(len(places))
+    shift[places], spread[places] = mean, scale
+    return f, _corrective(form, others, (places, rate), (shift, spread))
+
+
+def _corrective(
+    form: Form,
+    parts: list[Array],
+    to: tuple[IntArray, Array],
+    standard: tuple[Array, Array],
+) -> Corrective | None:
+    (places, rate), (shift, scale) = to, map(jnp.asarray, standard)
+    if form.kind == "polynomial":
+        columns = [*places.tolist(), len(places)]
+        factors = tuple(tuple(columns[c] for c in f) for f in form.factors)
+        return Polynomial(shift, scale, jnp.asarray(rate[:, None] * parts[0]), factors)
+    if form.kind == "tanh":
+        directions = np.zeros((form.units, len(places)))
+        directions[:, places] = parts[0][:, :-1]
+        return Perceptron(
+            shift,
+            scale,
+            weights=(jnp.asarray(directions), jnp.asarray(rate[:, None] * parts[1])),
+            biases=(jnp.asarray(parts[0][:, -1]), jnp.zeros(form.states)),
+        )
+    return None
+
+
+# -- what is told -------------------------------------------------------------------------------
+
+
+def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[str], list[str]]:
+    form = found.best.form
+    count = form.states - form.outputs
+    off = f"{np.sqrt(found.best.error):.3g} standard deviations"
+    plural = "s" * (count != 1)
+    kind = {"none": "a linear equation", "tanh": f"{form.units} tanh units in all rows"}.get(
+        form.kind, f"a polynomial of degree {_degree(form)} in all rows"
+    )
+    checks = [
+        f"{count} hidden state{plural} and {kind}: rollouts are off by {off} "
+        "where data were left out"
+    ]
+    if len(found.gains) > 1:
+        listed = ", ".join(f"{k}: {np.sqrt(v):.3g}" for k, v in found.gains.items())
+        checks.append(f"linear models by their number of hidden states are off by {listed}")
+    if found.kinds_tried:
+        listed = ", ".join(f"{k} {np.sqrt(v):.3g}" for k, v in found.kinds_tried.items())
+        kind = found.kinds[0] if len({*found.kinds}) == 1 else "as told"
+        checks.append(
+            f"{', '.join(free)} between samples: {listed}; {kind} was taken (inputs sets another)"
+        )
+    if found.steps > 1:
+        checks.append(
+            f"made for {found.steps} steps per sample ({found.standard.step / found.steps:.3g} s): "
+            "with half as many, what the integration adds would be learned"
+        )
+    return _doubts(found, hidden), checks
+
+
+def _degree(form: Form) -> int:
+    return max((sum(c < form.width for c in f) for f in form.factors), default=1)
+
+
+def _doubts(found: Found, hidden: HiddenSettings) -> list[str]:
+    """More hidden states than the data tell apart, and what the last one gained."""
+    form = found.best.form
+    count = form.states - form.outputs
+    fewer = [(c, e) for _, c, e in found.tried if c == count - 1]
+    if hidden.count is None or not fewer or found.best.error < _NOTHING * min(e for _, e in fewer):
+        return []
+    least = min(e for _, e in fewer)
+    return [
+        f"hidden.count is {count}, more than the data can tell: with {count - 1} rollouts are off "
+        f"by {np.sqrt(least):.3g} standard deviations where data were left out, with {count} by "
+        f"{np.sqrt(found.best.error):.3g}; set hidden.count to {count - 1}, or to null"
+    ]

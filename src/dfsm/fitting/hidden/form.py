@@ -1,0 +1,137 @@
+"""The equation of a model with hidden states, in standardised variables.
+
+    ẋ = A x + B v + b + e(x, v),      y = the first of x
+
+e is nothing, a polynomial, or a layer of tanh units W₂ tanh(W₁ [x, v] + c). Where stability is
+asked for, A = P⁻¹ (S - R Rᵀ - ε P - |P W₂| |W₁| 1) with S skew, whatever R and S are: dᵀ P d of the
+difference d of any two rollouts then falls by exp(-2 ε t) at least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.types import Array
+from dfsm.models.corrective.polynomial import REACH, monomials, products
+from dfsm.numerics.runge_kutta import rk4_step
+
+Kind = Literal["none", "polynomial", "tanh"]
+# Rollouts that run away end here, in standard deviations.
+_FAR = 30.0
+
+
+@dataclass(frozen=True)
+class Form:
+    """Sizes and structure; hashable, so that compiled code knows them.
+
+    Attributes
+    ----------
+    states, outputs, inputs
+        Numbers of x, y and v.
+    kind
+        Of e.
+    units
+        Tanh units.
+    factors
+        Monomials of the polynomial, see `models.corrective.polynomial`.
+    metric
+        P, row by row, where stability is asked for.
+    margin
+        ε per typical step, beside `metric`.
+    """
+
+    states: int
+    outputs: int
+    inputs: int
+    kind: Kind = "none"
+    units: int = 0
+    factors: tuple[tuple[int, ...], ...] = ()
+    metric: tuple[tuple[float, ...], ...] = ()
+    margin: float = 0.0
+
+    @property
+    def width(self) -> int:
+        """Number of x and v."""
+        return self.states + self.inputs
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Of the parameter arrays: [A, B, b] first."""
+        linear = [(self.states, self.width + 1)]
+        if self.kind == "polynomial":
+            return [*linear, (self.states, len(self.factors))]
+        if self.kind == "tanh":
+            return [*linear, (self.units, self.width + 1), (self.states, self.units)]
+        return linear
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(int(np.prod(s)) for s in self.shapes)
+
+    def parts(self, weights: jax.Array | Array) -> list[jax.Array]:
+        """The parameter arrays as the equation takes them, A as it is in the equation."""
+        raw, start = [], 0
+        for shape in self.shapes:
+            count = int(np.prod(shape))
+            raw.append(jnp.reshape(weights[start : start + count], shape))
+            start += count
+        if self.metric:
+            raw[0] = jnp.concatenate([self._contracting(raw), raw[0][:, self.states :]], axis=1)
+        return raw
+
+    def _contracting(self, raw: list[jax.Array]) -> jax.Array:
+        n, P = self.states, np.array(self.metric)
+        M = raw[0][:, :n]
+        R, skew = jnp.tril(M), jnp.triu(M, 1) - jnp.triu(M, 1).T
+        gain = 0.0
+        if self.kind == "tanh":
+            W1, W2 = raw[1][:, :n], raw[2]
+            gain = jnp.sqrt(jnp.sum((P @ W2) ** 2) * jnp.sum(W1**2) + 1e-24)
+        pull = R @ R.T + self.margin * P + gain * np.eye(n)
+        return jnp.linalg.solve(P, skew - pull)
+
+    def rate(self, parts: list[jax.Array], x: jax.Array, v: jax.Array) -> jax.Array:
+        """ẋ at one point."""
+        z = jnp.concatenate([x, v])
+        total = parts[0][:, :-1] @ z + parts[0][:, -1]
+        if self.kind == "polynomial":
+            return total + parts[1] @ products(jnp.clip(z, -REACH, REACH), self.factors)
+        if self.kind == "tanh":
+            return total + parts[2] @ jnp.tanh(parts[1][:, :-1] @ z + parts[1][:, -1])
+        return total
+
+    def interval(
+        self, parts: list[jax.Array], x: jax.Array, h: jax.Array, v: jax.Array
+    ) -> jax.Array:
+        """States a sample later.
+
+        Parameters
+        ----------
+        parts
+            See `parts`.
+        x
+            ``(state,)``.
+        h
+            Length of the interval.
+        v
+            Inputs at the start, middle and end of every step in it, ``(step, 3, input)``.
+        """
+        rate = lambda x, v: self.rate(parts, x, v)  # noqa: E731
+        for k in range(v.shape[0]):
+            x, _ = rk4_step(rate, x, h / v.shape[0], (v[k, 0], v[k, 1], v[k, 2]))
+        return jnp.clip(x, -_FAR, _FAR)
+
+
+def polynomial(form: Form, degree: int, most: int) -> Form:
+    """The form with a polynomial, of a lower degree where there would be too many monomials."""
+    while degree > 2 and len(monomials(form.width, degree)) > most:
+        degree -= 1
+    factors = monomials(form.width, degree)
+    return Form(form.states, form.outputs, form.inputs, "polynomial", 0, factors)

@@ -1,0 +1,276 @@
+"""Which equation: how many hidden states, what corrects them, what inputs do, how long a step.
+
+Everything is decided on stretches of the records that are left out. Linear systems decide how many
+hidden states are tried, several nonlinear starts follow from the best of them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.data.between import Between
+from dfsm.data.trajectory import Trajectory
+from dfsm.fitting.hidden.error import HiddenError
+from dfsm.fitting.hidden.form import Form, polynomial
+from dfsm.fitting.hidden.settings import HiddenSettings
+from dfsm.fitting.hidden.starts import (
+    Candidate,
+    contracting,
+    improved,
+    linear_start,
+    nonlinear_start,
+    runs_away,
+    subspace,
+)
+from dfsm.fitting.hidden.windows import Standard, Windows, standard_of, windows_of
+
+# A further hidden state must lower the squared error on data left out to this share; another
+# interpolation to this; and half the step must change rollouts by no more than this share of it.
+_WORTH_A_STATE, _WORTH_A_KIND, _STEP_ERROR = 0.7, 0.95, 0.01
+# Linear systems whose squared error is no more than so many times the least may be enough.
+_NEARLY = 2.0
+_MOST_STEPS = 8
+_MOST_MONOMIALS = 60
+# Steps to follow a change of the integration, and to learn from all of many data at last.
+_FOLLOW, _LAST = 8, 5
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found.
+
+    Attributes
+    ----------
+    best
+        After it has seen all data; its error is that on data left out before.
+    standard
+        Scales of the variables.
+    kinds
+        What each input does between samples.
+    steps
+        Of the integration per sample.
+    windows
+        All data.
+    gains
+        Squared errors on data left out of linear systems, by the number of hidden states.
+    tried
+        The same of nonlinear ones: what they were, and the error.
+    kinds_tried
+        By what inputs that nobody named do between samples.
+    """
+
+    best: Candidate
+    standard: Standard
+    kinds: tuple[Between, ...]
+    steps: int
+    windows: Windows
+    gains: dict[int, float]
+    tried: list[tuple[str, int, float]]
+    kinds_tried: dict[str, float]
+
+
+def search(
+    records: Sequence[Trajectory],
+    outputs: int,
+    kinds: Sequence[Between],
+    open_kinds: Sequence[bool],
+    settings: HiddenSettings,
+    seed: int,
+) -> Found:
+    """Find the equation that meets data left out best.
+
+    Parameters
+    ----------
+    records
+        Outputs and inputs of every run, in this order.
+    outputs
+        How many of the channels are outputs.
+    kinds
+        What each input does between samples, as far as it is known.
+    open_kinds
+        Which of these the data decide.
+    settings
+        See `HiddenSettings`.
+    seed
+        Of the draws.
+    """
+    standard, kinds = standard_of(records, outputs), tuple(kinds)
+    windows = windows_of(records, standard, kinds, 1, settings.samples)
+    linear = _linear(records, standard, windows, settings)
+    gains = {c: candidate.error for c, candidate in linear.items()}
+    first = _promising(linear)[0]
+    kinds, kinds_tried = _interpolation(
+        records, standard, linear[first], (kinds, open_kinds), settings
+    )
+    windows = windows_of(records, standard, kinds, 1, settings.samples)
+    best, tried = _ascended(linear, windows, settings, seed)
+    best, steps = _steps(records, standard, best, kinds, settings)
+    everything = windows_of(records, standard, kinds, steps).with_all()
+    error = best.error
+    weights = _restarted(
+        best, windows_of(records, standard, kinds, steps, settings.samples), everything
+    )
+    few = everything.used.sum() <= settings.samples
+    last = settings.iterations if few else _LAST
+    final = improved(best.form, everything, weights, settings.decay, last)
+    final = replace(final, error=error)
+    return Found(final, standard, kinds, steps, everything, gains, tried, kinds_tried)
+
+
+def _linear(
+    records: Sequence[Trajectory], standard: Standard, windows: Windows, settings: HiddenSettings
+) -> dict[int, Candidate]:
+    """Linear systems by the number of hidden states."""
+    ny, nv = len(standard.outputs[0]), len(standard.inputs[0])
+    counts = range(settings.most + 1) if settings.count is None else [settings.count]
+    found = subspace(records, standard, ny + max(counts))
+    each = [linear_start(found, Form(ny + c, ny, nv), windows) for c in counts]
+    if settings.stable is not None:
+        margin = settings.stable * standard.step
+        each = [contracting(c, margin) for c in each]
+    return dict(zip(counts, each, strict=True))
+
+
+def _promising(linear: dict[int, Candidate]) -> list[int]:
+    """Numbers of hidden states from the least that a linear system is nearly as good with."""
+    least = min(c.error for c in linear.values())
+    first = min(c for c in linear if linear[c].error <= _NEARLY * least)
+    return [c for c in sorted(linear) if c >= first and np.isfinite(linear[c].error)]
+
+
+def _ascended(
+    linear: dict[int, Candidate], windows: Windows, settings: HiddenSettings, seed: int
+) -> tuple[Candidate, list[tuple[str, int, float]]]:
+    """The best of all, from few hidden states to more, until one more is not worth it.
+
+    What is nonlinear looks like further states to a linear system: it only tells where to begin.
+    """
+    best, tried = None, []
+    for count in _promising(linear):
+        candidates = list(_nonlinear(linear[count], windows, settings, seed))
+        tried += [(c.form.kind, count, c.error) for c in candidates]
+        # Where all run away, the linear one stays.
+        first = min([*candidates, linear[count]], key=lambda c: c.error)
+        if best is not None and first.error > _WORTH_A_STATE * best.error:
+            break
+        best = first
+    if best is None:
+        raise ValueError("no number of hidden states to try")
+    return best, tried
+
+
+def _nonlinear(
+    linear: Candidate, windows: Windows, settings: HiddenSettings, seed: int
+) -> Iterable[Candidate]:
+    """Candidates from one linear system, several at a time."""
+
+    def one(task: tuple[Form, int]) -> Candidate:
+        form, draw = task
+        weights = nonlinear_start(linear, form, draw)
+        found = improved(form, windows, weights, settings.decay, settings.iterations)
+        return replace(found, error=np.inf) if runs_away(found, windows) else found
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(one, _forms(linear.form, settings, seed))
+
+
+def _forms(base: Form, settings: HiddenSettings, seed: int) -> list[tuple[Form, int]]:
+    """What is tried beside a linear form, the polynomial first, and the draw of each."""
+    if settings.form == "none":
+        return [(base, 0)]
+    forms: list[tuple[Form, int]] = []
+    if settings.form in (None, "polynomial") and settings.stable is None:
+        forms.append((polynomial(base, settings.degree, _MOST_MONOMIALS), 0))
+    if settings.form in (None, "tanh"):
+        tanh = replace(base, kind="tanh", units=settings.units)
+        forms += [(tanh, seed * settings.starts + k) for k in range(settings.starts)]
+    return forms
+
+
+def _interpolation(
+    records: Sequence[Trajectory],
+    standard: Standard,
+    linear: Candidate,
+    kinds: tuple[tuple[Between, ...], Sequence[bool]],
+    settings: HiddenSettings,
+) -> tuple[tuple[Between, ...], dict[str, float]]:
+    """What inputs that nobody named do between samples, by what explains the data.
+
+    A nonlinear start tells, the simplest there is: beside what a linear system leaves over, what
+    inputs do between samples may be little.
+    """
+    now, open_kinds = kinds
+    if not any(open_kinds):
+        return now, {}
+    form = _forms(linear.form, settings, 0)[0][0]
+    start = nonlinear_start(linear, form, 0)
+    tried: dict[str, tuple[Between, ...]] = {}
+    errors: dict[str, float] = {}
+    for kind in get_args(Between):
+        pairs = zip(now, open_kinds, strict=True)
+        tried[kind] = tuple(kind if free else k for k, free in pairs)
+        windows = windows_of(records, standard, tried[kind], 1, settings.samples)
+        errors[kind] = improved(form, windows, start, settings.decay, settings.iterations).error
+    current = next(k for k, free in zip(now, open_kinds, strict=True) if free)
+    least = min(errors, key=errors.__getitem__)
+    return tried[least if errors[least] < _WORTH_A_KIND * errors[current] else current], errors
+
+
+def _steps(
+    records: Sequence[Trajectory],
+    standard: Standard,
+    best: Candidate,
+    kinds: tuple[Between, ...],
+    settings: HiddenSettings,
+) -> tuple[Candidate, int]:
+    """Steps per sample at which rollouts are what they are at half of it."""
+    steps = 1
+    while steps < _MOST_STEPS:
+        finer = windows_of(records, standard, kinds, 2 * steps, settings.samples)
+        here = windows_of(records, standard, kinds, steps, settings.samples)
+        apart = HiddenError(best.form, here).paths(best.weights)
+        apart = apart - HiddenError(best.form, finer).paths(best.weights)
+        change = np.mean(np.sum(apart[..., : best.form.outputs] ** 2, -1))
+        if change <= _STEP_ERROR * best.error * best.form.outputs:
+            break
+        steps *= 2
+        best = improved(best.form, finer, best.weights, settings.decay, _FOLLOW)
+    return best, steps
+
+
+def _restarted(best: Candidate, few: Windows, everything: Windows) -> Array:
+    """The same parameters with states at the starts of all windows."""
+    form = best.form
+    if len(few.y) == len(everything.y):
+        return best.weights
+    n = form.states
+    starts = np.zeros((len(everything.y), n))
+    starts[:, : form.outputs] = everything.y[:, 0]
+    weights = np.concatenate([best.parameters, starts.ravel()])
+    return started(form, weights, everything)
+
+
+def started(form: Form, weights: Array, windows: Windows, steps: int = 12) -> Array:
+    """Weights whose states at the starts of windows fit these best, by damped Gauss-Newton."""
+    error = HiddenError(form, windows)
+    p, n = form.size, form.states
+    before = error.cost(weights)
+    for _ in range(steps):
+        JtJ, Jtr = error.normal_equations(weights)
+        change = np.zeros_like(weights)
+        for i in range(len(windows.y)):
+            at = slice(p + n * i, p + n * (i + 1))
+            change[at] = -np.linalg.solve(JtJ[at, at] + 1e-3 * np.eye(n), Jtr[at])
+        trial = weights + np.clip(change, -2, 2)
+        after = error.cost(trial)
+        if not after < before * (1 - 1e-6):
+            break
+        weights, before = trial, after
+    return weights
