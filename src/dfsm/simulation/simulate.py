@@ -240,11 +240,8 @@ def simulate(
 
     def case(i: int, drive: Drive) -> Case[Drive]:
         begins = float(driven[i].time[0])
-        if starts is not None:
-            x0 = starts[i]
-        else:
-            told = model.signals.startup
-            x0 = (told_state if told else _observed_state)(model, batch[i], begins)
+        tell = told_state if model.signals.startup else _observed_state
+        x0 = tell(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latents_from_past(model, batch[i], begins)])
         return Case(drive, x0, initial_azimuth(model, batch[i], begins), fields[i].values)
