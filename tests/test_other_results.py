@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from conftest import Dfsm
 from dfsm.data.readers import read
@@ -185,6 +187,96 @@ def test_samples_of_bladed_that_do_not_fit(tmp_path):
     assert "signals at one time are announced" in sentence(path)
     path = tower(tmp_path, place=["AXIVAL 1.0 2.0"])
     assert "2 places on the axis 'Tower station height', but DIMENS announces 3" in sentence(path)
+
+
+# -- QBlade -------------------------------------------------------------------------------------
+
+
+def qblade(path: Path, names: list[str], end: str = "\t\n") -> Path:
+    """Two lines of titles, names and rows with a tab behind every cell, six digits."""
+    head = "Results Output File created with QBlade on 31.08.2026 at 09:10:56\nTime: 8 m/s, NREL\n"
+    table = np.stack([TIME, 0 * TIME + 0.05, 100 + 50 * TIME, 1e6 * np.cos(TIME)], axis=1)
+    rows = ["\t".join(f"{v:.5E}" for v in row) + end for row in table]
+    path.write_text(head + "\t".join(names) + end + "".join(rows))
+    return path
+
+
+def test_exports_of_qblade(tmp_path):
+    names = ["Time [s]", "Timestep [s]", "X_g Mom. TWR Bot. (1) [Nm]", "Aerodynamic Power [kW]"]
+    for spelled in (names, [n.replace(" ", "_") for n in names]):
+        run = read(qblade(tmp_path / "a.txt", spelled))
+        assert [c.unit for c in run.channels] == ["s", "Nm", "kW"]
+        assert run.names[1].replace("_", " ") == "X g Mom. TWR Bot. (1)"
+        np.testing.assert_allclose(run.time, TIME, atol=1e-12)
+        np.testing.assert_allclose(run.values[:, 2], 1e6 * np.cos(TIME), rtol=1e-5)
+        # Six digits of numbers that are mostly between 1e5 and 1e6.
+        assert 0.5 < (run.channels[2].step or 0) < 10
+    cut = tmp_path / "cut.txt"
+    cut.write_text((tmp_path / "a.txt").read_text()[:-9])
+    run = read(cut)
+    assert len(run) == 29
+    assert any("that record is left out" in note for note in run.notes)
+
+
+# -- WEC-Sim ------------------------------------------------------------------------------------
+
+
+def six(k: int) -> np.ndarray:
+    return np.sin(np.outer(TIME, k + np.arange(6)))
+
+
+def part(name: str, **matrices: np.ndarray) -> dict:
+    return {"name": name, "time": TIME[:, None], **matrices}
+
+
+def structs(*parts: dict) -> np.ndarray:
+    return np.array([[tuple(p.values()) for p in parts]], dtype=[(k, object) for k in parts[0]])
+
+
+def test_the_output_of_wecsim_saved_as_a_struct(tmp_path):
+    path = tmp_path / "a.mat"
+    none = np.empty((0, 0))
+    bodies = [
+        part(
+            n, position=six(k), velocity=six(k + 1), forceTotal=six(k + 2), cellPressures_time=none
+        )
+        for k, n in ((1, "float"), (4, "spar"))
+    ]
+    ends = np.arange(9.0)[:, None]
+    wave = {"type": "irregular", "time": TIME[:, None], "elevation": np.cos(TIME)[:, None]}
+    output = {
+        "bodies": structs(*bodies),
+        "cables": {},
+        "moorDyn": {"Lines": {"Time": ends, "FairTen1": ends}},
+        "ptos": part("p", forceActuation=six(2), powerInternalMechanics=six(3)),
+        "wave": wave,
+    }
+    savemat(path, {"output": output})
+    run = read(path)
+    units = {c.name: c.unit for c in run.channels}
+    assert units["bodies_1.position_3"] == units["wave.elevation"] == "m"
+    assert [units[f"bodies_2.velocity_{i}"] for i in (3, 4)] == ["m/s", "rad/s"]
+    assert [units[f"ptos.forceActuation_{i}"] for i in (1, 6)] == ["N", "N m"]
+    assert units["ptos.powerInternalMechanics_6"] == "W"
+    np.testing.assert_array_equal(run["bodies_2.forceTotal_5"], six(6)[:, 4])
+    assert [n.split(" left out")[0] for n in run.notes] == [
+        "'moorDyn.Lines.Time'",
+        "'moorDyn.Lines.FairTen1'",
+    ]
+    # Other matrices of six have no units that anybody knows.
+    savemat(path, {"float": part("float", position=six(1))})
+    assert {c.unit for c in read(path).channels} == {""}
+
+
+def test_objects_of_wecsim_are_told_how_to_save(tmp_path):
+    path = tmp_path / "a.mat"
+    savemat(path, {"k": 1.0})
+    raw = path.read_bytes()
+    # An opaque array as MATLAB writes it: flags, and three names.
+    texts = [struct.pack("<II", 1, len(t)) + t.ljust(8, b"\0") for t in (b"output", b"MCOS")]
+    body = struct.pack("<IIII", 6, 8, 17, 0) + b"".join(texts)
+    path.write_bytes(raw + struct.pack("<II", 14, len(body)) + body)
+    assert "'output' is an object that only MATLAB reads: save it as a struct" in sentence(path)
 
 
 # -- uniform winds ------------------------------------------------------------------------------

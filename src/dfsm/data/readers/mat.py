@@ -27,6 +27,7 @@ from dfsm.data.readers.hawc2 import from_gtsdf, is_gtsdf
 from dfsm.data.readers.hdf5 import read_hdf5
 from dfsm.data.readers.mat4 import is_mat4, read_mat4
 from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
+from dfsm.data.readers.wecsim import is_label, is_wecsim, wecsim_unit
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -96,7 +97,9 @@ def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:
 
 def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) -> Trajectory:
     """Every vector and matrix that is as long as the time."""
-    found = dict(_flat(content, ""))
+    found, wecsim = dict(_flat(content, "")), is_wecsim(content)
+    if wecsim:
+        found = {n: v for n, v in found.items() if not is_label(v)}
     numbers = {
         n: v for n, v in found.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiub"
     }
@@ -122,9 +125,11 @@ def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) 
         if table is None or (other is not None and not _same_times(numbers[other], time)):
             notes.append(f"'{name}' left out: {_why(value, len(time), other)}")
             continue
-        single = table.shape[1] == 1
+        width = table.shape[1]
         columns += list(table.T)
-        channels += [Channel(name if single else f"{name}_{i + 1}") for i in range(table.shape[1])]
+        names = [name] if width == 1 else [f"{name}_{i + 1}" for i in range(width)]
+        units = [wecsim_unit(name, i, width) if wecsim else "" for i in range(width)]
+        channels += map(Channel, names, units)
     values = np.stack(columns, axis=1) if columns else np.empty((len(time), 0))
     return assemble(path, time, values, channels, notes=notes)
 
@@ -180,6 +185,11 @@ def _without_time(
         if step is None and value.size == 1:
             step = rate_step(name.rsplit(".", 1)[-1], float(value.ravel()[0]))
             source = f"stands in '{name}'"
+    if step is None and found.get("output") is OTHER:
+        raise DfsmError(
+            f"{path}: no time, and 'output' is an object that only MATLAB reads: save it as a "
+            "struct (output = struct(output); save('run.mat', 'output'))"
+        )
     if step is None:
         raise no_time(path, [Channel(f"{n} ({_what(v)})") for n, v in found.items()])
     lengths = [max(v.shape) for v in numbers.values() if v.size > 1]
