@@ -26,6 +26,7 @@ from dfsm.data.readers import read, with_wall_times
 from dfsm.data.readers.rotor_table import read_rotor_table
 from dfsm.data.readers.tables import write_table
 from dfsm.data.readers.turbsim import read_turbsim
+from dfsm.data.readers.uniform import UniformSettings, read_uniform
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.model_folder import load_all
@@ -105,6 +106,8 @@ def _tables(folder: Path) -> list[Sample]:
     found.append(_file("run.out", _out(run), _said, folder))
     found.append(_file("run.outb", _outb(run), _said, folder))
     found.append(_file("field.bts", wind_field(), _wind, folder))
+    found.append(_file("gust.wnd", _GUST, _uniform, folder))
+    found.append(_bladed(run, folder))
     found.append(_file("rotor.txt", _rotor(), lambda p: read_rotor_table(p).cp.tolist(), folder))
     return found
 
@@ -117,6 +120,35 @@ def _said(path: Path) -> Any:
 def _wind(path: Path) -> Any:
     field = read_turbsim(path)
     return field.mean_wind, [block.sum() for block in field.blocks()]
+
+
+_GUST = b"""! Time Speed Dir Vert HShr VShr VLin Gust
+0.0  8.0   0.0 0.0 0.0 0.2 0.00 0.0
+5.0 10.0   1.0 0.0 0.1 0.2 0.05 2.0
+9.0 12.0 359.0 0.1 0.1 0.1 0.05 0.0
+"""
+
+
+def _uniform(path: Path) -> Any:
+    wind = read_uniform(path, UniformSettings(hub_height=90.0))
+    return [block.sum() for block in wind.over(np.arange(4.0), 50.0).blocks()]
+
+
+def _bladed(run: Trajectory, folder: Path) -> Sample:
+    """A header of Bladed, with samples beside it that stay as they are."""
+    head = ["ACCESS D", "FORM U", "RECL 4", "FORMAT R*8", "NDIMENS 3", f"DIMENS 1 3 {len(run)}"]
+    head += ["GENLAB 'Tower'", "VARIAB 'Tower My'", "VARUNIT FL", "AXISLAB 'Height'", "AXIUNIT L"]
+    head += ["AXIMETH 3", "AXIVAL 0.0", " 20.5 87.25", "AXISLAB 'Time'", "AXIUNIT T", "AXIMETH 2"]
+    head += ["MIN 0.0", "STEP 5.0000001E-002", "NVARS 0", ""]
+
+    def put(damaged: bytes, where: Path) -> Path:
+        run.values.astype("<f8").tofile(where / "damaged.$25")
+        path = where / "damaged.%25"
+        path.write_bytes(damaged)
+        return path
+
+    raw = "\r\n".join(head).encode()
+    return Sample("run.%25", raw, put, _said, _said(put(raw, folder)), checked=False)
 
 
 def _out(run: Trajectory) -> bytes:
