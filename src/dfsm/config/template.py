@@ -76,11 +76,10 @@ nonlinear_only: {nonlinear_only}  # also fit the nonlinear-only model, for compa
 # refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8, network: 16, decay: 3,
 #          seconds: 600}}
 refine: {refine}
-# Hidden states beside the measured ones, learned on rollouts instead of derivatives (null: none).
+# Hidden states beside the measured ones, learned on rollouts instead of derivatives.
 # How many, what corrects them and what inputs do between samples is chosen on data left out:
 # hidden: {{count: 2, form: tanh, units: 6, starts: 6, startup: 5, stable: null}}
-hidden: {hidden}
-seed: 0
+{hidden}seed: 0
 
 # Structures to try: dfsm compare {name} -o comparison/ ranks them, and the one above, on a share of
 # the training runs. Each names the keys that it changes.
@@ -160,7 +159,7 @@ def fill(
         corrective=_NO_CORRECTION if turbine else _CORRECTION,
         azimuth=_azimuth(states, varying, turbine),
         nonlinear_only="false" if turbine else "true",
-        hidden="{}" if proposed.hidden else "null",
+        hidden="hidden: {}\n" if proposed.hidden else "",
         refine=_REFINE if turbine and long and len(runs) > 1 else "null",
     )
 
