@@ -9,7 +9,7 @@ dimensions, of SI: ``FL`` is a moment in N m.
 
 `.$PJ`, the project beside them, stands for all groups of the run.
 
-Source: Bladed User Manual, appendix "Bladed output file format"; files of Bladed 4.
+Source: result files of Bladed 4, and how openfast_toolbox reads them.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Every body, constraint, PTO, cable and mooring has its time and matrices of six 
 translations, three rotations. All is in SI, angles in rad. The ``output`` that WEC-Sim leaves in
 the workspace is an object, which only MATLAB reads: ``output = struct(output)`` makes it a struct.
 
-Sources: WEC-Sim, ``responseClass``; WEC-Sim documentation, "Units" and "Output Structure".
+Source: WEC-Sim, ``responseClass``.
 """
 
 from __future__ import annotations
