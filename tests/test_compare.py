@@ -168,7 +168,7 @@ def test_what_has_not_changed_is_not_fitted_again(runs, tmp_path, monkeypatch):
 
 
 def test_a_killed_comparison_goes_on(here):
-    config = declared(**{f"c{i}": {"gate": 0.1 + i / 100} for i in range(6)})
+    config = declared(**{f"c{i}": {"gate": 0.1 + i / 100} for i in range(4)})
     write_config(Path("c.yaml"), config)
     command = [sys.executable, "-c", "from dfsm.cli import main; main()"]
     command += ["compare", "c.yaml", "-o", "out", "--jobs", "2", "--json"]

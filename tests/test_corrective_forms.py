@@ -144,7 +144,7 @@ def test_it_comes_back_from_what_is_kept(form):
 
 
 def test_the_registry_names_every_form_of_the_package():
-    assert list(FORMS) == ["gaussian_units", "perceptron"]
+    assert list(FORMS) == ["gaussian_units", "perceptron", "polynomial"]
     assert {kind: FORMS[kind].kind for kind in FORMS} == {kind: kind for kind in FORMS}
 
 

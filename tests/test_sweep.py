@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,6 +121,8 @@ def test_the_command_closes_the_loop_with_a_controller_of_ones_own(here, dfsm, f
     assert said["over_all"]["y"]["std_ratio"] == pytest.approx(ratio, rel=1e-6)
     assert run["replay"]["q"]["nrmse"] < 0.3
     assert "u" not in run["replay"]
+    # Python's own modules keep their names, whatever the file is called.
+    assert not hasattr(sys.modules.get("control"), "mine")
     assert Path("page.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     for text, sentence in (
         ("control.py", "--controller is 'control.py' without a name"),

@@ -151,12 +151,14 @@ def _own(path: Path, name: str) -> Controller:
     from dfsm.core.files import existing_file
 
     path = existing_file(path)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    # A name of its own: a file control.py must not stand for the package of that name.
+    own = f"dfsm_controller_{path.stem}"
+    spec = importlib.util.spec_from_file_location(own, path)
     if spec is None or spec.loader is None:
         raise DfsmError(f"{path} is no Python file: {_HOLDS}")
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look their module up.
-    sys.modules[path.stem] = module
+    sys.modules[own] = module
     try:
         spec.loader.exec_module(module)
     except DfsmError:
