@@ -181,7 +181,7 @@ def test_names_cannot_break_the_config(here, dfsm, name):
     assert parse_config(Path("c.yaml")).data.train == [file]
     assert list(YAML(typ="safe").load(Path("c.yaml"))) == [
         *("data", "signals", "inputs", "derivatives", "linear", "terms"),
-        *("corrective", "gate", "azimuth", "nonlinear_only", "refine", "hidden", "seed"),
+        *("corrective", "gate", "azimuth", "nonlinear_only", "refine", "seed"),
     ]
     assert names[0] == name
 
