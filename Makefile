@@ -14,10 +14,9 @@ demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/demo.py --output out
 	$(BIN)/python examples/iea15/optimal_control.py --models out --output out
 
-# Everything but the studies. Without XLA's fusion emitters, at its lowest level and in one part loops
-# are compiled in half the time and take up to twice as long: tests compile more than they compute.
-test: export XLA_FLAGS += --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
-	--xla_cpu_parallel_codegen_split_count=1
+# Everything but the studies. Without XLA's fusion emitters and at its lowest level loops are compiled
+# in half the time and take up to twice as long: tests compile more than they compute.
+test: export XLA_FLAGS += --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 test: $(VENV)/.installed-dev
 	$(PYTEST) -m "not slow"
 
