@@ -8,7 +8,7 @@ PIP_OPTIONS := --quiet --disable-pip-version-check --no-compile
 # Long files first, each file in one process: its models are fitted once.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test studies lint style types contracts wheel docs bench clean
+.PHONY: demo test studies notebooks lint style types contracts wheel docs bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/demo.py --output out
@@ -18,11 +18,15 @@ demo: $(VENV)/.installed
 # in half the time and take up to twice as long: tests compile more than they compute.
 test: export XLA_FLAGS += --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 test: $(VENV)/.installed-dev
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not notebook"
 
 # What the documentation states, computed again. Only files that hold studies are collected.
 studies: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $$(grep -l 'mark\.slow' tests/test_*.py)
+
+# Notebooks and the start page, from top to bottom.
+notebooks: $(VENV)/.installed-dev
+	$(PYTEST) -m notebook tests/test_notebooks.py tests/test_pages.py
 
 lint: style types contracts
 

@@ -22,7 +22,7 @@ def test_each_is_paired_listed_and_thin():
         assert len(text.splitlines()) < 110
 
 
-@pytest.mark.slow
+@pytest.mark.notebook
 @pytest.mark.filterwarnings("ignore::dfsm.errors.DfsmWarning")
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_it_runs(path, tmp_path, monkeypatch):

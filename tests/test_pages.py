@@ -199,7 +199,7 @@ def test_the_five_minutes_begin_as_told(start, dfsm):
     assert proposed["signals"]["controls"] == ["Torque"]
 
 
-@pytest.mark.slow
+@pytest.mark.notebook
 def test_the_five_minutes_end_as_told(start, dfsm):
     blocks, quick = start
     for words in commands(PAGES["docs/start.md"]):
