@@ -56,3 +56,39 @@ class Drawn(Shown):
             There is no such channel or engine, or Matplotlib is not installed.
         """
         return draw(self, channels, engine)
+
+
+class DrawnByRun(Drawn):
+    """A result over several runs with a figure of one of them."""
+
+    __slots__ = ()
+
+    def plot(
+        self,
+        channels: Sequence[str] | None = None,
+        *,
+        run: int | str = 0,
+        engine: Engine = "plotly",
+    ) -> Any:
+        """Draw one run: as recorded or as it was before, and what became of it.
+
+        Parameters
+        ----------
+        channels
+            Names to draw, in this order; None takes what a reader asks for first.
+        run
+            Which run, by its index or name.
+        engine
+            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
+
+        Returns
+        -------
+        plotly.graph_objects.Figure or matplotlib.figure.Figure
+            To show, change or save.
+
+        Raises
+        ------
+        DfsmError
+            There is no such channel, run or engine, or Matplotlib is not installed.
+        """
+        return draw(self, channels, engine, run=run)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from dfsm.controllers.discon import Value
-from dfsm.core.drawing import Drawn, Engine, draw
+from dfsm.core.drawing import DrawnByRun
 from dfsm.core.files import json_value
 from dfsm.core.types import Array
 from dfsm.loops.tuning_problem import TuningProblem
@@ -70,7 +70,7 @@ class FrontPoint:
 
 
 @dataclass(frozen=True, eq=False)
-class TuningResult(Drawn):
+class TuningResult(DrawnByRun):
     """Result of `tune`.
 
     Attributes
@@ -122,36 +122,6 @@ class TuningResult(Drawn):
     evaluations: int
     gradients: int
     seconds: float
-
-    def plot(
-        self,
-        channels: Sequence[str] | None = None,
-        *,
-        run: int | str = 0,
-        engine: Engine = "plotly",
-    ) -> Any:
-        """Draw one run: the closed loop with the controller as it was, and tuned.
-
-        Parameters
-        ----------
-        channels
-            Names to draw, in this order; None takes those that were measured.
-        run
-            Which run, by its index or name.
-        engine
-            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
-
-        Returns
-        -------
-        plotly.graph_objects.Figure or matplotlib.figure.Figure
-            To show, change or save.
-
-        Raises
-        ------
-        DfsmError
-            There is no such channel, run or engine, or Matplotlib is not installed.
-        """
-        return draw(self, channels, engine, run=run)
 
     @property
     def at_bounds(self) -> list[str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dfsm.controllers.controller import Controller
-from dfsm.core.drawing import Drawn, Engine, draw
+from dfsm.core.drawing import DrawnByRun
 from dfsm.core.files import json_value
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import hushed
@@ -92,7 +92,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class ClosedLoopValidation(Drawn):
+class ClosedLoopValidation(DrawnByRun):
     """Closed loops against records.
 
     Attributes
@@ -149,36 +149,6 @@ class ClosedLoopValidation(Drawn):
             nrmse=float(np.mean([r.loop_errors[channel].nrmse for r in runs])),
             replay_nrmse=_mean(errors),
         )
-
-    def plot(
-        self,
-        channels: Sequence[str] | None = None,
-        *,
-        run: int | str = 0,
-        engine: Engine = "plotly",
-    ) -> Any:
-        """Draw one run: the record, the closed loop and the open-loop replay.
-
-        Parameters
-        ----------
-        channels
-            Names to draw, in this order; None takes all in their order.
-        run
-            Which run, by its index or name.
-        engine
-            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
-
-        Returns
-        -------
-        plotly.graph_objects.Figure or matplotlib.figure.Figure
-            To show, change or save.
-
-        Raises
-        ------
-        DfsmError
-            There is no such channel, run or engine, or Matplotlib is not installed.
-        """
-        return draw(self, channels, engine, run=run)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a table of one line per channel: means and ratios over the runs, as `row`."""

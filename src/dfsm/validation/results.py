@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dfsm.core.drawing import Drawn, Engine, draw
+from dfsm.core.drawing import DrawnByRun
 from dfsm.core.files import json_value
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import Channel, Trajectory
@@ -165,7 +165,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class Validation(Drawn):
+class Validation(DrawnByRun):
     """Everything that a report shows.
 
     Attributes
@@ -284,36 +284,6 @@ class Validation(Drawn):
         if len(known) < len(times):
             return None
         return float(np.mean(known)) / self.wall_time(model)
-
-    def plot(
-        self,
-        channels: Sequence[str] | None = None,
-        *,
-        run: int | str = 0,
-        engine: Engine = "plotly",
-    ) -> Any:
-        """Draw one run: the record beside what every model made of it.
-
-        Parameters
-        ----------
-        channels
-            Names to draw, in this order; None takes measured states and outputs.
-        run
-            Which run, by its index or name.
-        engine
-            "plotly" for the screen, "matplotlib" for print (needs ``dfsm[figures]``).
-
-        Returns
-        -------
-        plotly.graph_objects.Figure or matplotlib.figure.Figure
-            To show, change or save.
-
-        Raises
-        ------
-        DfsmError
-            There is no such channel, run or engine, or Matplotlib is not installed.
-        """
-        return draw(self, channels, engine, run=run)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a table of one line per run, model and channel: errors, and how rollouts ended."""
