@@ -18,9 +18,12 @@ from scipy.linalg import expm
 
 from benchmarks.twins import TWINS
 from dfsm.config.proposal import propose
+from dfsm.config.template import write_config
 from dfsm.data.derivatives import StateSpec
+from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
 from dfsm.fitting.hidden.error import HiddenError
 from dfsm.fitting.hidden.form import Form
@@ -195,12 +198,43 @@ def test_polynomial() -> None:
     np.testing.assert_array_equal(again(jnp.array([3.0, b])), e(jnp.array([3.0, b])))
 
 
-def test_init_tells_what_is_driven(recorded: Recorder) -> None:
+def test_init_tells_what_is_driven(recorded: Recorder, tmp_path: Path) -> None:
     """Where derivatives do not tell, the past does: u drives y, and hidden states beside it."""
-    proposal = propose([recorded(1)], ["u", "y"], [])
+    run = recorded(1)
+    proposal = propose([run], ["u", "y"], [])
     assert proposal.states == [{"name": "y", "order": 1}]
     assert [*proposal.controls, *proposal.disturbances] == ["u"]
     assert proposal.hidden
+    # What the recorded channels leave of the derivative, and what to do, is said in the file.
+    rate = np.gradient(run["y"], run.time)
+    known = np.column_stack([run["u"], run["y"], np.ones(len(rate))])
+    left = rate - known @ np.linalg.lstsq(known, rate, rcond=None)[0]
+    np.testing.assert_allclose(proposal.unexplained["y"], left.std() / rate.std(), rtol=1e-6)
+    write_table(run, tmp_path / "run.csv")
+    told = write_config([str(tmp_path / "run.csv")], tmp_path / "config.yaml")
+    assert told.startswith("Derivatives are not to be fitted here")
+    assert f"# {told}\nhidden: {{}}\n" in (tmp_path / "config.yaml").read_text(encoding="utf-8")
+
+
+def test_a_fit_of_derivatives_tells_where_it_is_out_of_place(recorded: Recorder) -> None:
+    """Behind a lag and a nonlinearity derivatives tell little: hidden states are named."""
+    run = TWINS["wiener_hammerstein"].record(400, 1)
+    settings = FitSettings(
+        states=(StateSpec(name="y"),),
+        disturbances=("u",),
+        corrective=NoCorrection(),
+        nonlinear_only=False,
+    )
+    match = "derivatives are not to be fitted here.* leaves 97% of that of 'y'.* set hidden: {} in"
+    with pytest.warns(DfsmWarning, match=match):
+        fit([run], settings)
+    # Where y and u tell the rate, nothing is said.
+    lag = [0.0]
+    for v in run["u"][:-1]:
+        lag.append(lag[-1] + 0.2 * (v - 0.5 * lag[-1]))
+    first = replace(settings, states=(StateSpec(name="z"),), inputs="hold")
+    told = fit([run.with_channels("z", np.array(lag))], first)
+    assert not any("derivatives" in text for text in told.model.provenance.record["warnings"])
 
 
 def test_the_data_tell_what_an_input_does_between_samples() -> None:
@@ -224,6 +258,6 @@ def test_the_data_tell_what_an_input_does_between_samples() -> None:
 def test_init_tells_twins_apart() -> None:
     """Each of our twins of published benchmarks gets hidden states and its input."""
     for twin in TWINS.values():
-        proposal = propose([twin.record(1000, 1)], ["u", "y"], [])
+        proposal = propose([twin.record(600, 1)], ["u", "y"], [])
         assert proposal.hidden, twin.name
         assert [s["name"] for s in proposal.states] == ["y"]

@@ -117,7 +117,9 @@ def init(
     if output.exists() and not force:
         raise DfsmError(f"{output} exists: choose another name with -o, or replace it with --force")
     with working(quiet):
-        write_config(files, output, step)
+        told = write_config(files, output, step)
+    if told:
+        say(f"{told}: the file proposes hidden: {{}} for states that nobody measures", quiet)
     say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
 

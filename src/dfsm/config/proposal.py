@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.config.causes import driven_by_past
 from dfsm.core.types import Array
 from dfsm.data.between import recognised
 from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.fitting.causes import driven_by_past
 
 # What wind engineers usually choose; only names that exist are proposed. The rate of a rotor's
 # speed is none of its states: nothing that is recorded explains how it changes.
@@ -60,6 +60,9 @@ class Proposal:
         Controls and disturbances that stay and jump, and so are held between samples.
     hidden
         Whether what is measured has states beside it that nobody measures.
+    unexplained
+        Then, of the derivatives of the states, what recorded channels leave: RMS over the standard
+        deviation, by state.
     """
 
     states: list[dict[str, Any]]
@@ -73,6 +76,7 @@ class Proposal:
     turbine: bool = False
     held: tuple[str, ...] = ()
     hidden: bool = False
+    unexplained: dict[str, float] = field(default_factory=dict)
 
 
 def propose(
@@ -146,6 +150,7 @@ def _of_anything(
 ) -> Proposal:
     states, outputs, controls, disturbances = [], [], [], []
     shares: list[float] = []
+    left: dict[str, float] = {}
     names = [n for n in varying if n not in rates]
     if len(names) > _MOST_CHANNELS:
         return Proposal([], [], [], parameters, [], [], reasons)
@@ -158,6 +163,7 @@ def _of_anything(
         others = np.delete(table, i, axis=1)
         known = next((r for r, base in rates.items() if base == name), None)
         once = _explained(first[:, i], table)
+        left[name] = float(np.sqrt(max(0.0, 1 - once)))
         twice = _explained(second[:, i], np.column_stack([table, first[:, i]]))
         if known or (twice >= _STATE and twice > once):
             states.append(_second_order(name, rates))
@@ -178,7 +184,8 @@ def _of_anything(
             reasons[name] = "disturbance (or control): nothing recorded explains it"
     unclear = not shares or min(shares) < _CLEAR or not (controls or disturbances)
     if not rates and unclear and (driven := driven_by_past(run, names)):
-        return _with_hidden(run, names, driven, parameters, reasons)
+        hidden = _with_hidden(run, names, driven, parameters, reasons)
+        return replace(hidden, unexplained={n: left[n] for n in driven if n in left})
     return Proposal(states, controls, disturbances, parameters, outputs, [], reasons)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from ruamel.yaml import YAML
 
-from dfsm.config.proposal import propose
+from dfsm.config.proposal import Proposal, propose
 from dfsm.core.files import check_file, write_file
 from dfsm.core.types import Array
 from dfsm.data.info import ChannelInfo, describe
@@ -92,7 +92,7 @@ refine: {refine}
 """
 
 
-def write_config(files: Sequence[str], path: Path, step: float | None = None) -> None:
+def write_config(files: Sequence[str], path: Path, step: float | None = None) -> str:
     """Write a configuration for some runs.
 
     Parameters
@@ -104,6 +104,11 @@ def write_config(files: Sequence[str], path: Path, step: float | None = None) ->
     step
         Interval between samples in s of files that hold no time.
 
+    Returns
+    -------
+    str
+        What a user should know of the proposal; empty where that is nothing.
+
     Raises
     ------
     DfsmError
@@ -112,15 +117,16 @@ def write_config(files: Sequence[str], path: Path, step: float | None = None) ->
     runs = read_all(files, step=step)
     check_file(path, [r.source for r in runs])
     names = _relative([r.source or r.name for r in runs], path.parent)
-    text = fill(runs, names, path.name, step)
+    text, told = fill(runs, names, path.name, step)
     with write_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+    return told
 
 
 def fill(
     runs: Sequence[Trajectory], train: Sequence[str], name: str, step: float | None = None
-) -> str:
-    """Fill the template with channels that all runs share."""
+) -> tuple[str, str]:
+    """Fill the template with channels that all runs share; also what there is to tell of it."""
     first = describe(runs[0])
     common = set(runs[0].names).intersection(*(r.names for r in runs))
     shared = {c.name: c for c in first.channels if c.name in common}
@@ -136,7 +142,8 @@ def fill(
     if wind:
         linear = _LPV.format(schedule=_flow(wind), margin=margin)
     driving = [*proposed.disturbances, *proposed.controls]
-    return _TEXT.format(
+    advice = _hidden_told(proposed)
+    text = _TEXT.format(
         name=printable(name),
         train=_block(train),
         start=_TRANSIENT if long and turbine else "null",
@@ -159,8 +166,20 @@ def fill(
         corrective=_NO_CORRECTION if turbine else _CORRECTION,
         azimuth=_azimuth(states, varying, turbine),
         nonlinear_only="false" if turbine else "true",
-        hidden="hidden: {}\n" if proposed.hidden else "",
+        hidden=f"# {printable(advice)}\nhidden: {{}}\n" if advice else "",
         refine=_REFINE if turbine and long and len(runs) > 1 else "null",
+    )
+    return text, advice
+
+
+def _hidden_told(proposed: Proposal) -> str:
+    """Why derivatives are not to be fitted, where hidden states are proposed."""
+    if not proposed.hidden:
+        return ""
+    left = ", ".join(f"{share:.0%} of that of {n}" for n, share in proposed.unexplained.items())
+    return (
+        f"Derivatives are not to be fitted here (what is recorded leaves {left}): hidden fits "
+        "rollouts instead"
     )
 
 

@@ -31,6 +31,7 @@ from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
 from dfsm.fitting.gate import correct, predicted
+from dfsm.fitting.hidden.advice import hidden_advice
 from dfsm.fitting.hidden.build import fit_hidden, require_hidden
 from dfsm.fitting.known import known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
@@ -183,6 +184,8 @@ def fit(
     with _timed(seconds, "checks"):
         notes, checks, judged = check(model, recorded, data, settings, doubt)
         notes += more
+        if hidden is None and refinement is None:
+            notes += hidden_advice(e.decisions, data, settings, doubt)
     known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
     notes = list(dict.fromkeys(known))
     checks = [*_inputs_told(samples, settings), *f.notes, *learned, *checks]
