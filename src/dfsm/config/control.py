@@ -21,7 +21,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.model_folder import load
 from dfsm.simulation.simulate import initial_state
 
-_ADVICE = "write one, docs/how-to/problem.md shows how"
+_ADVICE = "write one as the documentation shows under 'Optimal control from a file'"
 
 Pair = tuple[float | None, float | None]
 

@@ -12,7 +12,7 @@ from dfsm.core.settings import require
 from dfsm.loops.sweep import SweepSettings
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS
 
-_ADVICE = "write one, docs/tuning.md shows how"
+_ADVICE = "write one as the documentation shows under 'Tuning'"
 
 
 class SweepConfig(LoopsConfig):

@@ -60,7 +60,8 @@ derivatives:
 linear:
 {linear}
 
-# Known physics in the linear fit: {terms}; docs/method.md has an example.
+# Known physics in the linear fit ({terms}), as in
+# [{{kind: product, factors: [{example}, {state}]}}]; in the documentation: Known physics.
 terms: []
 
 corrective:

@@ -15,7 +15,7 @@ from dfsm.errors import DfsmError
 from dfsm.loops.trust_region import TrustSettings
 from dfsm.loops.tuning_problem import Goal, Limit, TuneSettings, TuningProblem
 
-ADVICE = "write one, docs/tuning.md shows how"
+ADVICE = "write one as the documentation shows under 'Tuning'"
 
 
 class Flown(Strict):

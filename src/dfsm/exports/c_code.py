@@ -137,8 +137,12 @@ def _vectors(told: dict[str, Any]) -> list[str]:
             between = f", {kind} between samples" if kind else ""
             lines.append(f"  [{k}] {comment(entry['name'])}{unit}{between}")
     if told["latent_states"]:
-        lines.append(f"Nobody measures {comment(', '.join(told['latent_states']))}; at their start")
-        lines.append("values they are at rest under those of the inputs.")
+        names = comment(", ".join(told["latent_states"]))
+        lines += textwrap.wrap(
+            f"Nobody measures {names}; start values: {told['latent_starts']}", 96
+        )
+    if told["step"] is not None:
+        lines.append(f"Longest step: {told['step']:.6g} s.")
     for sentence in told["computed_inputs"]:
         lines += textwrap.wrap(comment(sentence), 96)
     return lines

@@ -26,7 +26,6 @@ from dfsm.exports.c_code import CSource, to_c
 from dfsm.exports.fmu_description import Variable, build_description, model_description
 from dfsm.exports.identifiers import numbers
 from dfsm.models.dfsm import DFSM
-from dfsm.simulation.fastest import REACH, fastest_rates
 
 Kind = Literal["model-exchange", "co-simulation"]
 KINDS: tuple[Kind, ...] = ("model-exchange", "co-simulation")
@@ -80,8 +79,8 @@ def write_fmu(
         ``"model-exchange"``, ``"co-simulation"``, or None for both.
     step
         Longest Runge-Kutta step of a co-simulation in s, the start value of the parameter
-        ``rk4_step``; None takes half of what the model's fastest eigenvalue allows, and 0.1 s at
-        most.
+        ``rk4_step``; None takes the step that the model was made for, else half of what its
+        fastest eigenvalue allows, and 0.1 s at most.
 
     Raises
     ------
@@ -95,7 +94,7 @@ def write_fmu(
     require(step is None or (np.isfinite(step) and step > 0), "step", step, "more than 0 s")
     check_file(path)
     code = to_c(model, path.stem)
-    step = _safe_step(model) if step is None else float(step)
+    step = _safe_step(model, code.description["step"]) if step is None else float(step)
     variables = _variables(code, step)
     kinds = KINDS if kind is None else (kind,)
     source = _source(model, code, variables, fmi)
@@ -120,11 +119,11 @@ def write_fmu(
     return FMU(path, variables, where, tuple(code.description["computed_inputs"]))
 
 
-def _safe_step(model: DFSM) -> float:
-    s, middle = model.signals, np.asarray(model.region.mean)[None]
-    columns = [s.order.column(name) for name in s.exogenous]
-    (rate,) = fastest_rates(model, [middle[:, columns]])
-    return float(min(_LONGEST, 0.5 * REACH / rate)) if rate > 0 else _LONGEST
+def _safe_step(model: DFSM, longest: float | None) -> float:
+    """The model's own step, or half of the longest one that is stable."""
+    if model.signals.step is not None or longest is None:
+        return min(_LONGEST, longest or _LONGEST)
+    return min(_LONGEST, 0.5 * longest)
 
 
 def _variables(code: CSource, step: float) -> tuple[Variable, ...]:
@@ -182,7 +181,8 @@ def _source(model: DFSM, code: CSource, variables: tuple[Variable, ...], fmi: in
     lines.append("static " + numbers("start_values", starts))
     lines.append("static " + numbers("nominal_values", nominal))
     folder = resources.files("dfsm.exports").joinpath("sources")
-    parts = [folder.joinpath(f).read_text(encoding="ascii") for f in ("instance.h", f"fmi{fmi}.c")]
+    files = ("instance.h", f"fmi{fmi}.c", "fmi.c")
+    parts = [folder.joinpath(f).read_text(encoding="ascii") for f in files]
     return "\n".join([*lines, *parts])
 
 

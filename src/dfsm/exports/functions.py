@@ -15,6 +15,7 @@ from dfsm.exports.program import Program
 from dfsm.exports.translate import UntranslatableError, translated
 from dfsm.models.dfsm import DFSM, functions_of_points
 from dfsm.models.latents import at_rest
+from dfsm.simulation.fastest import REACH, fastest_rates
 
 # The arguments of f and g, in this order.
 GROUPS = ("states", "controls", "disturbances", "parameters")
@@ -85,6 +86,8 @@ def description(model: DFSM) -> dict[str, Any]:
     for entry, kind in zip([*told["controls"], *told["disturbances"]], kinds, strict=False):
         entry["between_samples"] = kind
     told["latent_states"] = [c.name for c in s.latents]
+    told["latent_starts"] = _latent_starts(model)
+    told["step"] = longest_step(model)
     told["computed_inputs"] = computed_inputs(model)
     rate = s.azimuth_rate
     if rate is not None:
@@ -93,11 +96,37 @@ def description(model: DFSM) -> dict[str, Any]:
 
 
 def starting_values(model: DFSM) -> Mapping[str, Array]:
-    """The middle of the training data by group; latent states are at rest there."""
+    """The middle of the training data by group; latent states that inputs drive are at rest."""
     order = model.signals.order
     middle = at_rest(model, model.region.mean)
     groups = order.split(middle)
     return {g: np.asarray(v) for g, v in zip(GROUPS, groups, strict=True)}
+
+
+def _latent_starts(model: DFSM) -> str:
+    """What the start values of states are that nobody measures."""
+    s = model.signals
+    if not s.latents:
+        return ""
+    if s.startup:
+        return (
+            "their mean over the training runs; dfsm.simulate tells them from "
+            f"{s.startup:g} s of recorded inputs and measured states before the start"
+        )
+    return "at rest under the start values of the inputs"
+
+
+def longest_step(model: DFSM) -> float | None:
+    """Longest step of RK4 in s: the one that the model was made for, or what is stable.
+
+    `simulate` looks at the run for the second, here the operating points stand for it. None where
+    nothing limits the step.
+    """
+    s, operating = model.signals, np.asarray(model.region.operating)
+    columns = [s.order.column(name) for name in s.exogenous]
+    (rate,) = fastest_rates(model, [operating[:, columns]])
+    limits = [] if s.step is None else [s.step]
+    return min([*limits, REACH / rate] if rate > 0 else limits, default=None)
 
 
 def computed_inputs(model: DFSM) -> list[str]:

@@ -18,38 +18,16 @@ import sys
 import numpy as np
 
 GROUPS = ("states", "controls", "disturbances", "parameters")
-UNARY = {
-    **{n: getattr(np, n) for n in ("sign", "floor", "ceil", "sqrt", "exp", "log", "log1p")},
+APPLY = {
+    **{n: getattr(np, n) for n in ("abs", "sign", "floor", "ceil", "sqrt", "exp", "log", "log1p")},
     **{n: getattr(np, n) for n in ("expm1", "sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    "neg": np.negative,
-    "abs": np.abs,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "asinh": np.arcsinh,
-    "acosh": np.arccosh,
-    "atanh": np.arctanh,
+    **{f"a{n}": getattr(np, f"arc{n}") for n in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{"neg": np.negative, "add": np.add, "sub": np.subtract, "mul": np.multiply},
+    **{"div": np.divide, "pow": np.power, "rem": np.fmod, "atan2": np.arctan2},
+    **{"max": np.maximum, "min": np.minimum, "lt": np.less, "le": np.less_equal},
+    **{"gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal},
+    **{"and": np.logical_and, "or": np.logical_or, "not": np.logical_not},
     "erf": np.vectorize(math.erf, otypes=[float]),
-    "not": np.logical_not,
-}
-BINARY = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "pow": np.power,
-    "atan2": np.arctan2,
-    "max": np.maximum,
-    "min": np.minimum,
-    "rem": np.fmod,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "and": np.logical_and,
-    "or": np.logical_or,
 }
 REDUCE = {"sum": np.sum, "max": np.max, "min": np.min, "prod": np.prod}
 
@@ -70,8 +48,7 @@ class Program:
         """The function of one step, and the numbers of what it takes."""
         if kind == "apply":
             # Truth is a number here.
-            ufunc = (UNARY if len(of) == 1 else BINARY)[what]
-            return (lambda *v: ufunc(*v) * 1.0), of
+            return (lambda *v: APPLY[what](*v) * 1.0), of
         if kind == "select":
             return (lambda c, a, b: np.where(c != 0, a, b)), of
         if kind == "take":
@@ -91,6 +68,41 @@ class Program:
         for function, of in self.steps:
             values.append(function(*(values[k] for k in of)))
         return values[self.result]
+
+
+def between(time, values, kinds):
+    """Inputs as a function of the place of a sample and the time (s) since it."""
+    h, moves = np.diff(time)[:, None], np.diff(values, axis=0)
+    kinds, slope, bend = np.array(kinds), np.zeros_like(moves), np.zeros((2, *moves.shape))
+    slope[:, kinds == "linear"] = (moves / np.where(h > 0, h, np.inf))[:, kinds == "linear"]
+    if (smooth := kinds == "cubic").any() and len(time) > 1:
+        d = moves[:, smooth] / h
+        s = spline_slopes(h, d)
+        slope[:, smooth] = s[:-1]
+        bend[0][:, smooth] = (3 * d - 2 * s[:-1] - s[1:]) / h
+        bend[1][:, smooth] = (s[:-1] + s[1:] - 2 * d) / h**2
+    return lambda k, t: values[k] + t * (slope[k] + t * (bend[0][k] + t * bend[1][k]))
+
+
+def spline_slopes(h, d):
+    """Slopes of a cubic spline without knots at the second sample and the last but one."""
+    n = len(h) + 1
+    if n < 4 or h.min() <= 1e-6 * h.mean():
+        raise ValueError("inputs that are splines need four times or more, well apart")
+    low, main, high = np.zeros((3, n, 1))
+    low[1:-1], main[1:-1], high[1:-1] = h[1:], 2 * (h[:-1] + h[1:]), h[:-1]
+    right = np.empty((n, d.shape[1]))
+    right[1:-1] = 3 * (h[1:] * d[:-1] + h[:-1] * d[1:])
+    for i, (a, b), (p, q) in ((0, h[:2], d[:2]), (-1, h[:-3:-1], d[:-3:-1])):
+        main[i], right[i] = b, ((3 * a + 2 * b) * b * p + a**2 * q) / (a + b)
+    high[0], low[-1] = h[0] + h[1], h[-1] + h[-2]
+    for i in range(1, n):
+        share = low[i] / main[i - 1]
+        main[i], right[i] = main[i] - share * high[i - 1], right[i] - share * right[i - 1]
+    right[-1] /= main[-1]
+    for i in range(n - 2, -1, -1):
+        right[i] = (right[i] - high[i] * right[i + 1]) / main[i]
+    return right
 
 
 class Model:
@@ -134,19 +146,18 @@ class Model:
     def simulate(
         self, time, initial, controls, disturbances, parameters=(), azimuth=None, field=None
     ):
-        """States and outputs at `time` (s), by one classical Runge-Kutta step between two times.
+        """States and outputs at `time` (s), by classical Runge-Kutta steps.
 
-        Controls and disturbances have one row per time and go along lines between them, or are
-        held where the model holds them. `azimuth` is the first one in rad, `field` has rows too.
+        Controls and disturbances have one row per time; between two they do what the description
+        says (`between_samples`). One step leads from time to time, or several where it names a
+        shorter `step`. `azimuth` is the first one in rad, `field` has rows too.
         """
-        rows = len(time)
+        rows, h = len(time), np.diff(time)
         u, w = (np.asarray(v, dtype=float).reshape(rows, -1) for v in (controls, disturbances))
-        inputs, kinds = (
-            np.hstack([u, w]),
-            [e["between_samples"] for g in GROUPS[1:3] for e in self.description[g]],
-        )
-        held, first = np.array([k == "hold" for k in kinds], dtype=bool), u.shape[1]
+        kinds = [e["between_samples"] for g in GROUPS[1:3] for e in self.description[g]]
+        inputs, first = between(np.asarray(time, dtype=float), np.hstack([u, w]), kinds), u.shape[1]
         x, states, psi = np.asarray(initial, dtype=float), [], [azimuth]
+        parts = math.ceil(h.max(initial=0) / (self.description["step"] or np.inf) * (1 - 1e-9)) or 1
 
         def f(x, v):
             return self.derivative(x, v[:first], v[first:], parameters)
@@ -155,18 +166,19 @@ class Model:
         at = None if turn is None else self.names("states").index(turn["speed"])
         for k in range(rows):
             states.append(x)
-            if k + 1 == rows:
-                break
-            h, v0 = time[k + 1] - time[k], inputs[k]
-            v1 = np.where(held, v0, inputs[k + 1])
-            k1 = f(x, v0)
-            k2 = f(x + 0.5 * h * k1, 0.5 * (v0 + v1))
-            k3 = f(x + 0.5 * h * k2, 0.5 * (v0 + v1))
-            k4 = f(x + h * k3, v1)
-            new = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            if azimuth is not None and turn is not None:
-                psi.append(psi[-1] + 0.5 * h * turn["rad/s"] * (x[at] + new[at]))
-            x = new
+            if azimuth is not None and turn is not None and k:
+                psi.append(azimuth)
+            for part in range(parts if k + 1 < rows else 0):
+                s, since = h[k] / parts, h[k] / parts * part
+                v0, v1, v2 = (inputs(k, since + share * s) for share in (0.0, 0.5, 1.0))
+                k1 = f(x, v0)
+                k2 = f(x + 0.5 * s * k1, v1)
+                k3 = f(x + 0.5 * s * k2, v1)
+                k4 = f(x + s * k3, v2)
+                new = x + s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+                if azimuth is not None and turn is not None:
+                    azimuth = azimuth + 0.5 * s * turn["rad/s"] * (x[at] + new[at])
+                x = new
         fields = [()] * rows if field is None else field
         angles = psi if len(psi) == rows else [None] * rows
         outputs = [

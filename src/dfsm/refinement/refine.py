@@ -213,8 +213,9 @@ def _account(trials: Sequence[Trial]) -> str:
     """Errors of the runs held out, and how they differ from split to split."""
     first, last = np.sqrt([t.before for t in trials]), np.sqrt([t.after for t in trials])
     if len(trials) == 1:
+        runs = len(trials[0].training)
         return (
-            f"refined on {len(trials[0].training)} runs: the error of rollouts over those held out "
+            f"refined on {runs} run{'s' * (runs != 1)}: the error of rollouts over those held out "
             f"({', '.join(trials[0].validation)}) went from {first[0]:.3g} to {last[0]:.3g} "
             "standard deviations"
         )

@@ -18,12 +18,12 @@ typedef struct {
   double nextEventTime;
 } fmi2EventInfo;
 
-#if defined(_WIN32)
-#define API __declspec(dllexport)
-#else
-#define API __attribute__((visibility("default")))
-#endif
-#define SELF Instance *m = (Instance *)c; if (!m) return fmi2Error
+/* What fmi.c takes. */
+#define FMI(name) fmi2##name
+#define STATE(before, after) fmi2##before##FMUstate##after
+#define DESERIALIZE fmi2DeSerializeFMUstate
+#define DERIVATIVES fmi2GetDerivatives
+typedef char Byte;
 
 static fmi2Status told(Instance *m, fmi2Status status, const char *text) {
   if (status != fmi2OK && m->logger) {
@@ -34,9 +34,6 @@ static fmi2Status told(Instance *m, fmi2Status status, const char *text) {
 
 API const char *fmi2GetTypesPlatform(void) { return "default"; }
 API const char *fmi2GetVersion(void) { return "2.0"; }
-API fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const char *const k[]) {
-  SELF; (void)n; (void)k; m->logging = on; return fmi2OK;
-}
 
 API fmi2Component fmi2Instantiate(const char *name, int type, const char *guid,
     const char *resources, const fmi2CallbackFunctions *callbacks, fmi2Boolean visible,
@@ -52,32 +49,18 @@ API fmi2Component fmi2Instantiate(const char *name, int type, const char *guid,
   }
   return m;
 }
-API void fmi2FreeInstance(fmi2Component c) { free(c); }
 API fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, double tolerance,
     double start, fmi2Boolean stopDefined, double stop) {
   SELF; (void)toleranceDefined; (void)tolerance; (void)stopDefined; (void)stop;
   m->now.value[0] = start; return fmi2OK;
 }
 API fmi2Status fmi2EnterInitializationMode(fmi2Component c) { SELF; return fmi2OK; }
-API fmi2Status fmi2ExitInitializationMode(fmi2Component c) { SELF; return fmi2OK; }
-API fmi2Status fmi2Terminate(fmi2Component c) { SELF; return fmi2OK; }
-API fmi2Status fmi2Reset(fmi2Component c) { SELF; instance_reset(m); return fmi2OK; }
 
 API fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, double v[]) {
-  size_t i;
-  SELF;
-  for (i = 0; i < n; ++i) {
-    if (get_value(m, r[i], &v[i])) return told(m, fmi2Error, "there is no such variable");
-  }
-  return fmi2OK;
+  SELF; ANSWER(values_got(m, r, n, v));
 }
 API fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, const double v[]) {
-  size_t i;
-  SELF;
-  for (i = 0; i < n; ++i) {
-    if (set_value(m, r[i], v[i])) return told(m, fmi2Error, "this variable cannot have this value");
-  }
-  return fmi2OK;
+  SELF; ANSWER(values_set(m, r, n, v));
 }
 #define NONE(name, type) \
   API fmi2Status name(fmi2Component c, const fmi2ValueReference r[], size_t n, type v[]) { \
@@ -90,33 +73,6 @@ NONE(fmi2SetInteger, const int)
 NONE(fmi2SetBoolean, const fmi2Boolean)
 NONE(fmi2SetString, const char *const)
 
-API fmi2Status fmi2GetFMUstate(fmi2Component c, void **s) {
-  SELF;
-  if (!*s) *s = malloc(sizeof(State));
-  if (!*s) return fmi2Error;
-  memcpy(*s, &m->now, sizeof(State));
-  return fmi2OK;
-}
-API fmi2Status fmi2SetFMUstate(fmi2Component c, void *s) {
-  SELF; if (!s) return fmi2Error; memcpy(&m->now, s, sizeof(State)); return fmi2OK;
-}
-API fmi2Status fmi2FreeFMUstate(fmi2Component c, void **s) {
-  (void)c; if (s) { free(*s); *s = NULL; } return fmi2OK;
-}
-API fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, void *s, size_t *n) {
-  (void)c; (void)s; *n = sizeof(State); return fmi2OK;
-}
-API fmi2Status fmi2SerializeFMUstate(fmi2Component c, void *s, char b[], size_t n) {
-  (void)c; if (n < sizeof(State)) return fmi2Error; memcpy(b, s, sizeof(State)); return fmi2OK;
-}
-API fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const char b[], size_t n, void **s) {
-  (void)c;
-  if (n != sizeof(State)) return fmi2Error;
-  if (!*s) *s = malloc(n);
-  if (!*s) return fmi2Error;
-  memcpy(*s, b, n);
-  return fmi2OK;
-}
 API fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference u[], size_t nu,
     const fmi2ValueReference k[], size_t nk, const double dv[], double d[]) {
   SELF; (void)u; (void)nu; (void)k; (void)nk; (void)dv; (void)d;
@@ -124,43 +80,8 @@ API fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueRefe
 }
 
 /* -- model exchange -- */
-API fmi2Status fmi2EnterEventMode(fmi2Component c) { SELF; return fmi2OK; }
-API fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { SELF; return fmi2OK; }
 API fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
   SELF; memset(info, 0, sizeof *info); return fmi2OK;
-}
-API fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetPrior,
-    fmi2Boolean *event, fmi2Boolean *terminate) {
-  SELF; (void)noSetPrior; *event = 0; *terminate = 0; return fmi2OK;
-}
-API fmi2Status fmi2SetTime(fmi2Component c, double t) { SELF; m->now.value[0] = t; return fmi2OK; }
-API fmi2Status fmi2SetContinuousStates(fmi2Component c, const double x[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES) return told(m, fmi2Error, "another number of states was expected");
-  memcpy(m->now.value + AT_STATES, x, n * sizeof *x);
-  m->now.stale = 1;
-  return fmi2OK;
-}
-API fmi2Status fmi2GetContinuousStates(fmi2Component c, double x[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES) return told(m, fmi2Error, "another number of states was expected");
-  memcpy(x, m->now.value + AT_STATES, n * sizeof *x);
-  return fmi2OK;
-}
-API fmi2Status fmi2GetDerivatives(fmi2Component c, double dx[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES || update(m)) return told(m, fmi2Error, "no derivatives of these states");
-  memcpy(dx, m->now.value + AT_RATES, n * sizeof *dx);
-  return fmi2OK;
-}
-API fmi2Status fmi2GetEventIndicators(fmi2Component c, double z[], size_t n) {
-  SELF; (void)z; return n ? told(m, fmi2Error, "there are no event indicators") : fmi2OK;
-}
-API fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, double x[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES) return told(m, fmi2Error, "another number of states was expected");
-  memcpy(x, nominal_values, n * sizeof *x);
-  return fmi2OK;
 }
 
 /* -- co-simulation -- */

@@ -6,14 +6,14 @@ typedef void *fmi3Instance;
 typedef uint32_t fmi3ValueReference;
 typedef enum { fmi3OK, fmi3Warning, fmi3Discard, fmi3Error, fmi3Fatal } fmi3Status;
 typedef void (*fmi3Logger)(void *, fmi3Status, const char *, const char *);
-typedef void *fmi3FMUState;
 
-#if defined(_WIN32)
-#define API __declspec(dllexport)
-#else
-#define API __attribute__((visibility("default")))
-#endif
-#define SELF Instance *m = (Instance *)c; if (!m) return fmi3Error
+/* What fmi.c takes. */
+#define FMI(name) fmi3##name
+#define STATE(before, after) fmi3##before##FMUState##after
+#define DESERIALIZE fmi3DeserializeFMUState
+#define DERIVATIVES fmi3GetContinuousStateDerivatives
+typedef bool fmi3Boolean;
+typedef uint8_t Byte;
 
 static fmi3Status told(Instance *m, fmi3Status status, const char *text) {
   if (status != fmi3OK && m->logger) {
@@ -35,9 +35,6 @@ static fmi3Instance made(const char *name, const char *token, bool logging, void
 }
 
 API const char *fmi3GetVersion(void) { return "3.0"; }
-API fmi3Status fmi3SetDebugLogging(fmi3Instance c, bool on, size_t n, const char *const k[]) {
-  SELF; (void)n; (void)k; m->logging = on; return fmi3OK;
-}
 API fmi3Instance fmi3InstantiateModelExchange(const char *name, const char *token,
     const char *resources, bool visible, bool logging, void *environment, fmi3Logger logger) {
   (void)resources; (void)visible;
@@ -58,40 +55,22 @@ API fmi3Instance fmi3InstantiateScheduledExecution(const char *name, const char 
   (void)logger; (void)clock; (void)lock; (void)unlock;
   return NULL;
 }
-API void fmi3FreeInstance(fmi3Instance c) { free(c); }
 API fmi3Status fmi3EnterInitializationMode(fmi3Instance c, bool toleranceDefined, double tolerance,
     double start, bool stopDefined, double stop) {
   SELF; (void)toleranceDefined; (void)tolerance; (void)stopDefined; (void)stop;
   m->now.value[0] = start; return fmi3OK;
 }
-API fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { SELF; return fmi3OK; }
-API fmi3Status fmi3EnterEventMode(fmi3Instance c) { SELF; return fmi3OK; }
 API fmi3Status fmi3EnterStepMode(fmi3Instance c) { SELF; return fmi3OK; }
 API fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) { SELF; return fmi3OK; }
 API fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) { SELF; return fmi3OK; }
-API fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { SELF; return fmi3OK; }
-API fmi3Status fmi3Terminate(fmi3Instance c) { SELF; return fmi3OK; }
-API fmi3Status fmi3Reset(fmi3Instance c) { SELF; instance_reset(m); return fmi3OK; }
 
 API fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference r[], size_t n, double v[],
     size_t nv) {
-  size_t i;
-  SELF;
-  if (nv != n) return told(m, fmi3Error, "one value per variable was expected");
-  for (i = 0; i < n; ++i) {
-    if (get_value(m, r[i], &v[i])) return told(m, fmi3Error, "there is no such variable");
-  }
-  return fmi3OK;
+  SELF; ANSWER(nv == n ? values_got(m, r, n, v) : "one value per variable was expected");
 }
 API fmi3Status fmi3SetFloat64(fmi3Instance c, const fmi3ValueReference r[], size_t n,
     const double v[], size_t nv) {
-  size_t i;
-  SELF;
-  if (nv != n) return told(m, fmi3Error, "one value per variable was expected");
-  for (i = 0; i < n; ++i) {
-    if (set_value(m, r[i], v[i])) return told(m, fmi3Error, "this variable cannot have this value");
-  }
-  return fmi3OK;
+  SELF; ANSWER(nv == n ? values_set(m, r, n, v) : "one value per variable was expected");
 }
 #define NONE(kind, type) \
   API fmi3Status fmi3Get##kind(fmi3Instance c, const fmi3ValueReference r[], size_t n, type v[], \
@@ -140,34 +119,6 @@ API fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference r,
   SELF; (void)r; (void)i; (void)d; (void)j; (void)k; (void)n;
   return told(m, fmi3Error, "see the model description");
 }
-API fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *s) {
-  SELF;
-  if (!*s) *s = malloc(sizeof(State));
-  if (!*s) return fmi3Error;
-  memcpy(*s, &m->now, sizeof(State));
-  return fmi3OK;
-}
-API fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState s) {
-  SELF; if (!s) return fmi3Error; memcpy(&m->now, s, sizeof(State)); return fmi3OK;
-}
-API fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *s) {
-  (void)c; if (s) { free(*s); *s = NULL; } return fmi3OK;
-}
-API fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState s, size_t *n) {
-  (void)c; (void)s; *n = sizeof(State); return fmi3OK;
-}
-API fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState s, uint8_t b[], size_t n) {
-  (void)c; if (n < sizeof(State)) return fmi3Error; memcpy(b, s, sizeof(State)); return fmi3OK;
-}
-API fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const uint8_t b[], size_t n,
-    fmi3FMUState *s) {
-  (void)c;
-  if (n != sizeof(State)) return fmi3Error;
-  if (!*s) *s = malloc(n);
-  if (!*s) return fmi3Error;
-  memcpy(*s, b, n);
-  return fmi3OK;
-}
 API fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference u[], size_t nu,
     const fmi3ValueReference k[], size_t nk, const double s[], size_t ns, double d[], size_t nd) {
   SELF; (void)u; (void)nu; (void)k; (void)nk; (void)s; (void)ns; (void)d; (void)nd;
@@ -204,39 +155,6 @@ API fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, bool *needed, bool *term
 }
 
 /* -- model exchange -- */
-API fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, bool noSetPrior, bool *event,
-    bool *terminate) {
-  SELF; (void)noSetPrior; *event = *terminate = false; return fmi3OK;
-}
-API fmi3Status fmi3SetTime(fmi3Instance c, double t) { SELF; m->now.value[0] = t; return fmi3OK; }
-API fmi3Status fmi3SetContinuousStates(fmi3Instance c, const double x[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES) return told(m, fmi3Error, "another number of states was expected");
-  memcpy(m->now.value + AT_STATES, x, n * sizeof *x);
-  m->now.stale = 1;
-  return fmi3OK;
-}
-API fmi3Status fmi3GetContinuousStates(fmi3Instance c, double x[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES) return told(m, fmi3Error, "another number of states was expected");
-  memcpy(x, m->now.value + AT_STATES, n * sizeof *x);
-  return fmi3OK;
-}
-API fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, double dx[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES || update(m)) return told(m, fmi3Error, "no derivatives of these states");
-  memcpy(dx, m->now.value + AT_RATES, n * sizeof *dx);
-  return fmi3OK;
-}
-API fmi3Status fmi3GetEventIndicators(fmi3Instance c, double z[], size_t n) {
-  SELF; (void)z; return n ? told(m, fmi3Error, "there are no event indicators") : fmi3OK;
-}
-API fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, double x[], size_t n) {
-  SELF;
-  if (n != COUNT_STATES) return told(m, fmi3Error, "another number of states was expected");
-  memcpy(x, nominal_values, n * sizeof *x);
-  return fmi3OK;
-}
 API fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) {
   SELF; *n = 0; return fmi3OK;
 }

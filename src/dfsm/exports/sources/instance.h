@@ -7,6 +7,19 @@
 #include <stdlib.h>
 #include <string.h>
 
+#if defined(_WIN32)
+#define API __declspec(dllexport)
+#else
+#define API __attribute__((visibility("default")))
+#endif
+
+/* A version of FMI defines FMI(name), which puts its prefix before a name, and told(), which hands
+   an error on. The first word of every function, and its last one: a problem in words, or NULL. */
+#define SELF Instance *m = (Instance *)c; if (!m) return FMI(Error)
+#define ANSWER(problem) \
+  const char *text = (problem); \
+  return text ? told(m, FMI(Error), text) : FMI(OK)
+
 enum {
   AT_STATES = 1,
   AT_RATES = AT_STATES + COUNT_STATES,
@@ -88,6 +101,35 @@ static int set_value(Instance *m, unsigned int reference, double value) {
   m->now.value[reference] = value;
   m->now.stale = 1;
   return 0;
+}
+
+static const char *values_got(Instance *m, const unsigned int r[], size_t n, double v[]) {
+  size_t i;
+  for (i = 0; i < n; ++i) {
+    if (get_value(m, r[i], &v[i])) return "there is no such variable";
+  }
+  return NULL;
+}
+
+static const char *values_set(Instance *m, const unsigned int r[], size_t n, const double v[]) {
+  size_t i;
+  for (i = 0; i < n; ++i) {
+    if (set_value(m, r[i], v[i])) return "this variable cannot have this value";
+  }
+  return NULL;
+}
+
+static const char *states_copied(double *to, const double *from, size_t n) {
+  if (n != COUNT_STATES) return "another number of states was expected";
+  memcpy(to, from, n * sizeof *to);
+  return NULL;
+}
+
+/* Keep a state in memory of its own, which is made if there is none. */
+static int state_kept(void **kept, const void *state) {
+  if (!*kept) *kept = malloc(sizeof(State));
+  if (*kept) memcpy(*kept, state, sizeof(State));
+  return *kept != NULL;
 }
 
 /* March to another time by classical Runge-Kutta steps of at most `step`. */
