@@ -48,7 +48,7 @@ def hidden(kind: str) -> DFSM:
         else Perceptron(
             shift,
             scale,
-            (jnp.asarray(rng.normal(size=(6, 5))), jnp.asarray(0.3 * rng.normal(size=(3, 6)))),
+            (jnp.asarray(rng.normal(size=(6, 5))), jnp.asarray(0.05 * rng.normal(size=(3, 6)))),
             (jnp.asarray(rng.normal(size=6)), jnp.zeros(3)),
         )
     )

@@ -73,7 +73,7 @@ class DataConfig(Strict):
 class SignalConfig(Strict):
     """Channel names by role, see `FitSettings`.
 
-    Parameters that the files do not hold may be given here: ``{Ballast: {run1.outb: 1.0, …}}``, or
+    Parameters that the files do not hold may stand here: ``{Ballast: {run1.outb: 1.0, …}}``, or
     the name of a CSV table, see `read_parameters`.
     """
 

@@ -35,7 +35,7 @@ class PID(eqx.Module):
     setpoint
         What the measurement is to be.
     points
-        Values of the schedule at which gains are given, rising, shape ``(point,)``; None without.
+        Values of the schedule of the rows of gains, rising, shape ``(point,)``; None without.
     limits
         Lowest and highest command.
     smoothing

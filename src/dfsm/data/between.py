@@ -1,7 +1,7 @@
 """Inputs as they are between samples: held, joined by straight lines, or smooth.
 
 A controller with a sampling time, an operator, and a converter hold what they give out; a wind or a
-wave goes on between samples. What an input does there decides what it is found to effect: a held
+wave goes on between samples. What an input does there decides what it seems to effect: a held
 one, taken for a line, seems to act half a step early.
 """
 

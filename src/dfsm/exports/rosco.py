@@ -121,7 +121,7 @@ def write_rosco(
         File to write: time in s, collective pitch in rad, generator torque in N m.
     pitch, torque
         Controls to take, in a unit of an angle or of a torque; None takes the one whose name says
-        what it is (BldPitch1, BlPitchC1, PtchPMzc1; GenTq). With one of the two given and no such
+        what it is (BldPitch1, BlPitchC1, PtchPMzc1; GenTq). With one of the two named and no such
         name for the other, that one is left out.
     scenario
         Which one, counted from 1.

@@ -1,7 +1,7 @@
 """What JAX records of a function of vectors, as a `Program`.
 
 JAX writes a function down as primitives on arrays of any shape; a program has flat arrays. What
-only moves elements (slices, transposes, broadcasts) becomes one `take`, found by moving their
+only moves elements (slices, transposes, broadcasts) becomes one `take`, by moving their
 numbers instead; what does not depend on the inputs is computed here; loops of known length are
 written out; complex numbers are pairs of real ones.
 """

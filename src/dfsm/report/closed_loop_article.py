@@ -6,6 +6,7 @@ import numpy as np
 
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table
+from dfsm.report.dots import dots
 from dfsm.validation.closed_loop import (
     SHOWN_EXPONENT,
     ClosedLoopComparison,
@@ -28,24 +29,58 @@ def closed_loop_article(validation: ClosedLoopValidation, model: str, controller
     model, controller
         Names to show.
     """
-    done = f"{validation.completed} of {len(validation.runs)} closed loops came to their end."
+    about = (
+        f"{controller} on {model}, driven by disturbances only from the recorded state at the "
+        "start, beside the rollout along the recorded controls."
+    )
     sections = [
         Section(
             "figures",
             "Closed loop against the record",
-            (done, *validation.endings()),
+            (about, *validation.endings()),
             (over_runs(validation),),
+            _ratios(validation),
         ),
         Section("runs", "Each run", tables=(_by_run(validation),)),
     ]
     for run in validation.runs:
         if run.loop_statistics:
             sections.append(_drawn(run, validation.channels))
-    lede = (
-        f"{controller} on {model}, driven by disturbances only from the recorded state at the "
-        "start, beside the rollout along the recorded controls."
+    return Article("closed_loop", "Closed loop", _verdict(validation), tuple(sections))
+
+
+def _verdict(validation: ClosedLoopValidation) -> str:
+    """How many loops came to their end, and how far their motion is from the recorded one."""
+    count, ended = len(validation.runs), validation.completed
+    told = f"{ended} of {count} closed loop{'s' * (count != 1)} came to their end."
+    rows = {c.name: validation.row(c.name) for c in validation.channels}
+    stds = {n: r.std_ratio for n, r in rows.items() if r is not None and r.std_ratio is not None}
+    if not stds:
+        return told
+    low, high = min(stds, key=stds.__getitem__), max(stds, key=stds.__getitem__)
+    span = " to ".join(f"{stds[n]:.2f} ({n})" for n in dict.fromkeys((low, high)))
+    return f"{told} Their standard deviations are {span} times those of the record."
+
+
+def _ratios(validation: ClosedLoopValidation) -> tuple[Figure, ...]:
+    """Standard deviations and damage over the recorded ones, by channel."""
+    rows = [(c.name, validation.row(c.name)) for c in validation.channels]
+    known = [(name, row) for name, row in rows if row is not None]
+    if not known:
+        return ()
+    return (
+        dots(
+            "ratios",
+            f"Means over the runs; the damage-equivalent load (DEL) with m = {SHOWN_EXPONENT}.",
+            "closed loop / record",
+            [name for name, _ in known],
+            {
+                "standard deviation": [row.std_ratio for _, row in known],
+                "DEL": [row.damage_ratio for _, row in known],
+            },
+            {"as recorded": (1.0, 0)},
+        ),
     )
-    return Article("closed_loop", "Closed loop", lede, tuple(sections))
 
 
 def over_runs(validation: ClosedLoopValidation) -> Table:
@@ -74,9 +109,9 @@ def over_runs(validation: ClosedLoopValidation) -> Table:
         "All runs: simulated over recorded",
         (
             *("channel", "mean, recorded", "closed loop"),
-            *("std", "worst", "replay"),
-            *("DEL", "worst", "replay"),
-            *("NRMSE", "replay"),
+            *("std", "std, worst", "std, replay"),
+            *("DEL", "DEL, worst", "DEL, replay"),
+            *("NRMSE", "NRMSE, replay"),
         ),
         tuple(rows),
         note=(

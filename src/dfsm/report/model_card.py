@@ -12,8 +12,9 @@ from dfsm.core.version import __version__
 from dfsm.fitting.verdicts import TRENDS, USABLE
 from dfsm.models.dfsm import DFSM
 from dfsm.models.stability import told_growths
-from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table, listed
+from dfsm.report.article import Article, Figure, Section, Table, listed
 from dfsm.report.article_page import write_article
+from dfsm.report.dots import dots
 from dfsm.report.first_screen import GRADES
 from dfsm.report.model_tables import signal_table
 
@@ -98,7 +99,10 @@ def _good_for(record: Mapping[str, Any]) -> list[Section]:
         text = "Its record holds no rollouts: validate it on runs of your own with dfsm validate."
         sections = [Section("verdicts", "What it is good for", (text,))]
     else:
-        rows = tuple((v["name"], v["verdict"], v["nrmse"], v["text"]) for v in verdicts)
+        rows = tuple(
+            (v["name"], v["verdict"], v["nrmse"], v["text"].removeprefix(f"{v['verdict']}: "))
+            for v in verdicts
+        )
         table = Table(
             "verdicts",
             "Rollouts over the training runs; runs that it has not seen may do worse",
@@ -112,27 +116,20 @@ def _good_for(record: Mapping[str, Any]) -> list[Section]:
             Section("errors", "What it is good for", figures=figures),
             Section("verdicts", "Signal by signal", tables=(table,)),
         ]
-    warnings = tuple((str(text),) for text in record.get("warnings", ()))
-    if warnings:
-        table = Table("warnings", f"The fit warned of {len(warnings)}", ("warning",), warnings)
-        sections.append(Section("warnings", "What to mind", tables=(table,)))
+    if warnings := tuple(f"The fit warns: {text}." for text in record.get("warnings", ())):
+        sections.append(Section("warnings", "What to mind", warnings))
     return sections
 
 
 def _errors(verdicts: Sequence[Mapping[str, Any]]) -> Figure:
-    places = len(verdicts) - 1.0 - np.arange(len(verdicts))
-    errors = np.array([v["nrmse"] for v in verdicts], dtype=float)
-    ends = np.array([-0.5, len(verdicts) - 0.5])
-    curves = (
-        Curve("usable to the left", np.full(2, USABLE), ends, 3, "dashed"),
-        Curve("for trends only to the left", np.full(2, TRENDS), ends, 2, "dashed"),
-        Curve("this model", errors, places, 1, "points"),
+    return dots(
+        "errors-plot",
+        "Rollouts over the training runs.",
+        "error / spread of the record (NRMSE)",
+        [v["name"] for v in verdicts],
+        {"this model": [v["nrmse"] for v in verdicts]},
+        {"usable to the left": (USABLE, 3), "for trends only to the left": (TRENDS, 2)},
     )
-    ticks = tuple((float(p), v["name"]) for p, v in zip(places, verdicts, strict=True))
-    far = max(1.0, 1.1 * float(errors.max()))
-    title = "error / spread of the record (NRMSE)"
-    panel = Panel("", title, "", curves, ticks=ticks, x_range=(0.0, far))
-    return Figure("errors-plot", "Rollouts over the training runs.", (panel,))
 
 
 # -- where it holds, what taught it ---------------------------------------------------------------
@@ -152,7 +149,9 @@ def _holds(model: DFSM) -> Section:
 def _trained(record: Mapping[str, Any]) -> Section:
     data = record.get("data", ())
     seconds = sum(d.get("seconds", 0.0) for d in data)
-    text = f"{len(data)} runs, {seconds:.6g} s in all." if data else "Its record names no runs."
+    text = "Its record names no runs."
+    if data:
+        text = f"{len(data)} run{'s' * (len(data) != 1)}, {seconds:.6g} s in all."
     rows = tuple(
         (d["name"], d.get("samples"), d.get("seconds"), d.get("sha256", "")[:_DIGEST]) for d in data
     )

@@ -46,14 +46,27 @@ def solution_article(solution: Solution) -> Article:
     count = len(solution.trajectories)
     return Article(
         key="solution",
-        title=solution.name,
-        lede=solution.message[:1].upper() + solution.message[1:] + ".",
+        title=f"Optimal control: {solution.name}",
+        lede=_verdict(solution),
         sections=(
             *[_course(solution, k, count) for k in range(count)],
             Section("outcome", "Outcome", tables=(outcome(solution),)),
             *[_scenario(solution, k, count) for k in range(count)],
         ),
     )
+
+
+def _verdict(s: Solution) -> str:
+    """How the solve ended, what it came to, and what there is to doubt."""
+    told = [s.message[:1].upper() + s.message[1:], f"The objective is {s.objective:.4g}"]
+    if s.outside:
+        told.append(f"{100 * s.outside:.0f} % of the horizon is outside the training data")
+    if s.replays:
+        worst = max(r.relative for r in s.replays)
+        told.append(
+            f"Repeated by an adaptive integrator, the states are off by {100 * worst:.2g} % at most"
+        )
+    return ". ".join(told) + "."
 
 
 def outcome(s: Solution) -> Table:

@@ -11,6 +11,7 @@ from dfsm.loops.tuning_problem import Limit
 from dfsm.loops.tuning_result import TuningResult
 from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table
 from dfsm.report.article_page import write_article
+from dfsm.report.dots import dots
 from dfsm.simulation.closed_loop import LoopStatus
 
 _BEFORE, _AFTER = "before", "after"
@@ -20,9 +21,14 @@ _POINTS, _DRAWN = 3000, 3
 
 def tuning_article(result: TuningResult) -> Article:
     """What a page and the terminal show of a tuning."""
+    count = len(result.loops)
+    cost = (
+        f"{count} run{'s' * (count != 1)}, {result.evaluations} evaluations of all of them, "
+        f"{result.gradients} with slopes, in {result.seconds:.0f} s."
+    )
     sections = [
-        Section("parameters", "Parameters", (result.message,), (_parameters(result),)),
-        Section("measures", "Before and after", tables=(measures(result),)),
+        Section("measures", "Before and after", (), (measures(result),), _changed(result)),
+        Section("parameters", "Parameters", (cost,), (_parameters(result),)),
         Section("runs", "Each run", tables=(_by_run(result),)),
     ]
     if len(result.starts) > 1:
@@ -32,11 +38,39 @@ def tuning_article(result: TuningResult) -> Article:
     if result.changes:
         sections.append(_changes(result))
     sections += _series(result)
-    lede = (
-        f"{len(result.loops)} runs, {result.evaluations} evaluations of all of them, "
-        f"{result.gradients} with slopes, in {result.seconds:.0f} s."
+    return Article("tuning", "Tuning", _verdict(result), tuple(sections))
+
+
+def _verdict(result: TuningResult) -> str:
+    """What was gained, whether the limits hold, and what the search says of its end."""
+    before, after = result.before_objective, result.objective
+    if np.isfinite([before, after]).all() and before:
+        change = 100 * (after - before) / abs(before)
+        told = f"The objective goes from {before:.3g} to {after:.3g} ({change:+.0f} %)"
+    else:
+        told = f"The objective is {after:.3g}; the controller as it was has no stable loop"
+    if result.problem.constraints:
+        told += ", a limit is broken" if result.violation > 0 else ", all limits hold"
+    return f"{told}. {result.message[:1].upper()}{result.message[1:]}."
+
+
+def _changed(result: TuningResult) -> tuple[Figure, ...]:
+    """Measures after over before, where that is a number above zero."""
+    pairs = zip(result.problem.measures, result.before_figures, result.figures, strict=True)
+    shown = [(m.label, float(a / b)) for m, b, a in pairs if b and np.isfinite(a / b) and a / b > 0]
+    if not shown:
+        return ()
+    names, ratios = zip(*shown, strict=True)
+    return (
+        dots(
+            "changed",
+            "Every measure after over before, all runs with their weights.",
+            "after / before",
+            names,
+            {"tuned": ratios},
+            {"as it was": (1.0, 0)},
+        ),
     )
-    return Article("tuning", "Tuning", lede, tuple(sections))
 
 
 def write_tuning_page(result: TuningResult, path: Path) -> None:

@@ -57,7 +57,7 @@ class RankedCandidate:
     Attributes
     ----------
     name, changes
-        As given.
+        Those of the candidate.
     outcome
         Errors, times, number of parameters; the reason where it could not be fitted.
     score

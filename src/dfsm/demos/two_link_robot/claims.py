@@ -30,7 +30,7 @@ def claims_section(study: RobotStudy) -> Section:
     table = Table(
         "claims",
         "The paper's claims on the two-link robot",
-        ("Claim", "Paper", "Found here", "Holds"),
+        ("Claim", "Paper", "Here", "Holds"),
         rows,
     )
     return Section("claims", "Do the paper's claims hold?", tables=(table,))

@@ -44,7 +44,7 @@ _FOLLOW, _LAST = 8, 5
 
 @dataclass(frozen=True)
 class Found:
-    """What a search found.
+    """What came of a search.
 
     Attributes
     ----------
