@@ -104,7 +104,7 @@ def test_linearizations_hold_hidden_states():
     model = hidden("tanh")
     (point,) = to_state_space(model)
     assert point.steady
-    np.testing.assert_allclose(model.derivative(point.states, point.inputs), 0, atol=1e-9)
+    np.testing.assert_allclose(model.derivative(point.states, point.inputs, []), 0, atol=1e-9)
     dx = np.array([1e-6, -2e-6, 1e-6])
-    rate = np.asarray(model.derivative(point.states + dx, point.inputs))
+    rate = np.asarray(model.derivative(point.states + dx, point.inputs, []))
     np.testing.assert_allclose(rate, point.A @ dx, atol=1e-9)
