@@ -298,3 +298,68 @@ def test_hdf5_from_matlab(tmp_path):
     assert np.array_equal(run["x_2"], TIME**2)
     path.write_bytes(raw[: len(raw) // 2])
     assert "no readable HDF5 file" in sentence(path)
+
+
+# -- decimal commas, thousands, rates and times as loggers name them ------------------------------
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "  "])
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16"])
+def test_decimal_commas_are_read(tmp_path, separator, encoding):
+    rows = [[f"{t:.2f}", f"{np.sin(t):.3e}", f"{1234.5 * np.cos(t):.4f}"] for t in TIME]
+    lines = ["Zeit [s];Kraft [kN];Temp [°C]".replace(";", separator)]
+    lines += [separator.join(row).replace(".", ",") for row in rows]
+    run = read(put(tmp_path / "a.csv", "\r\n".join(lines) + "\r\n", encoding))
+    assert np.array_equal(run.values, np.array(rows, dtype=float)[:, 1:])
+    assert run.time_step == pytest.approx(0.1)
+    assert [(c.name, c.unit) for c in run.channels] == [("Kraft", "kN"), ("Temp", "°C")]
+    assert run.channel("Temp").step == 1e-4
+    assert "decimals have commas: read as numbers" in run.notes
+
+
+def test_thousands_in_both_ways_of_writing(tmp_path):
+    lines = ["sep=;", "Time;x;n"]
+    lines += [f"{t:.1f}".replace(".", ",") + ";1.234,5;12.000" for t in TIME]
+    european = read(put(tmp_path / "a.csv", "\n".join(lines) + "\n"))
+    lines = ["Time,x,n", *(f'{t:.1f},"1,234.5","12,000"' for t in TIME)]
+    american = read(put(tmp_path / "b.csv", "\n".join(lines) + "\n"))
+    for run in (european, american):
+        assert np.array_equal(run.values, np.tile([1234.5, 12000.0], (40, 1)))
+        assert run.time[-1] == pytest.approx(3.9)
+        assert len(run.notes) == 1
+        assert "thousands" in run.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("header", "cell", "step"),
+    [
+        ("x,dt [ms]", ",50", 0.05),
+        ("x,fs [kHz]", ",0.02", 0.05),
+        ("x,fs", ",20", 0.05),
+        ("# logger 3, Ts = 50 ms\nx", "", 0.05),
+        ("# fs = 2 kHz, gain 1\nx", "", 0.0005),
+        ("% fs: 20 samples/s\nx", "", 0.05),
+        ("Sample rate,20 Hz\nx", "", 0.05),
+    ],
+)
+def test_a_rate_has_the_unit_beside_it(tmp_path, header, cell, step):
+    lines = [header, *(f"{np.sin(t):.4f}{cell}" for t in TIME)]
+    run = read(put(tmp_path / "a.csv", "\n".join(lines) + "\n"))
+    assert run.names == ("x",)
+    assert run.time_step == pytest.approx(step, rel=1e-12)
+
+
+def test_an_interval_in_another_unit_is_none(tmp_path):
+    path = put(tmp_path / "a.csv", "x,dt [m]\n" + "1,50\n2,50\n" * 5)
+    assert "no time column" in sentence(path)
+
+
+@pytest.mark.parametrize(("count", "per"), [("milliseconds", 1000), ("seconds", 1)])
+def test_times_that_count_from_1970(tmp_path, count, per):
+    start = 1_452_428_640 * per
+    lines = ["timestamp,x", *(f"{start + k * per},{k**2}" for k in range(40))]
+    run = read(put(tmp_path / "a.csv", "\n".join(lines) + "\n"))
+    assert np.array_equal(run.time, np.arange(40.0))
+    assert run.notes == (
+        f"'timestamp' counts {count} since 1970: times are seconds since the first",
+    )

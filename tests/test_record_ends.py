@@ -113,7 +113,7 @@ def test_a_fit_asks_what_a_slower_channel_does():
 
 def test_angles_that_wrap_are_no_states():
     angle = np.cumsum(3 + np.sin(T))
-    for period, unit in ((360.0, "deg"), (2 * np.pi, "rad"), (360.0, "")):
+    for period, unit in ((360.0, "deg"), (2 * np.pi, "rad"), (360.0, ""), (1.0, "rev")):
         turning = angle * period / 360 % period
         wrap = wrapping(T, turning, unit)
         assert wrap is not None

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
+from dfsm.core.units import factor, known
 
-_PERIODS = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0, "rad": 2 * np.pi}
 # Fewer samples than this show nothing.
 _FEWEST = 20
 # Changes that make a rate, and the share of them that must be equally far apart.
@@ -44,10 +44,9 @@ def wrapping(time: Array, values: Array, unit: str) -> Wrap | None:
     Wrap | None
         None where all steps are those of a motion.
     """
-    plain = unit.strip().lower()
     if len(values) < _FEWEST or not np.isfinite(values).all():
         return None
-    for period in [_PERIODS[plain]] if plain in _PERIODS else [] if plain else [360.0, 2 * np.pi]:
+    for period in _turns(unit):
         # A step too many may lie between the last sample before the turn and the first after it.
         if not 0.75 * period < np.ptp(values) <= period * (1 + 1e-6):
             continue
@@ -58,6 +57,14 @@ def wrapping(time: Array, values: Array, unit: str) -> Wrap | None:
         if turns.any() and 0 < usual < period / 4 and moved.max() <= 2 * usual:
             return Wrap(period, int(turns.sum()), float(time[1:][turns][0]))
     return None
+
+
+def _turns(unit: str) -> list[float]:
+    """One turn in a unit of angles; in both that are usual where nobody knows the unit."""
+    if not known(unit):
+        return [360.0, 2 * np.pi]
+    turn = factor("rev", unit)
+    return [] if turn is None else [turn]
 
 
 def held_interval(time: Array, values: Array) -> float | None:

@@ -9,18 +9,27 @@ from pathlib import Path
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.core.units import factor, known
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 
 # The name, one separator at most, and the unit in brackets at the end.
 HEADER = re.compile(r"(.+?)[_ ]?(?:\[([^\[\]]*)\]|\(([^()]*)\))")
 TIME_NAMES = ("time", "t")
+# Names that count where no column has one of these: other spellings, and other languages.
+ALSO_TIME = (
+    *("time_s", "time_sec", "elapsed time", "elapsed_time", "elapsed", "zeit", "temps", "tiempo"),
+    *("tempo", "tijd", "tid"),
+)
 # What pandas calls a column that it saved or read without a name, and a name left blank.
 INDEX = re.compile(r"|unnamed: \d+|__index_level_\d+__", re.IGNORECASE)
 SECONDS = ("", "s", "sec", "second", "seconds")
 # Sampling interval in s, or rate in Hz, of a record without a time.
 INTERVAL_NAMES = ("ts", "dt", "t_s", "step", "sampling_time", "sampling_interval")
 RATE_NAMES = ("fs", "f_s", "sampling_rate", "sampling_frequency", "samplerate", "sample_rate")
+_PER_SECOND = ("samples/s", "samples/sec", "sample/s", "s/s", "sa/s", "sps")
+# Numbers of time since 1970 in 2001 and in 2100, in s, and what times them there may count.
+_SINCE_1970, _COUNTS = (1e9, 4.1e9), {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
 
 def split_header(text: str) -> tuple[str, str]:
@@ -88,15 +97,16 @@ def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TI
     DfsmError
         There is none, or its unit is not s.
     """
-    for i, channel in enumerate(channels):
-        if channel.name.lower() in names:
-            if channel.unit.lower() not in SECONDS:
-                raise DfsmError(
-                    f"{path}: its time '{channel.name}' is in '{channel.unit}', expected s: "
-                    "convert it"
-                )
-            return i
-    raise no_time(path, channels)
+    called = [channel.name.lower() for channel in channels]
+    at = next((i for kind in (names, ALSO_TIME) for i, n in enumerate(called) if n in kind), None)
+    if at is None:
+        raise no_time(path, channels)
+    if channels[at].unit.lower() not in SECONDS:
+        raise DfsmError(
+            f"{path}: its time '{channels[at].name}' is in '{channels[at].unit}', expected s: "
+            "convert it"
+        )
+    return at
 
 
 def no_time(path: Path, channels: Sequence[Channel]) -> DfsmError:
@@ -110,21 +120,51 @@ def no_time(path: Path, channels: Sequence[Channel]) -> DfsmError:
     )
 
 
-def rate_step(name: str, value: float) -> float | None:
+def rate_step(name: str, value: float, unit: str = "") -> float | None:
     """Sampling interval in s that a number called ``fs``, ``Ts`` or ``dt`` tells; None for others.
 
     Parameters
     ----------
     name
-        As in the file, in any case.
+        As in the file, in any case, with blanks or underscores.
     value
-        In Hz for a rate, in s for an interval.
+        In Hz for a rate, in s for an interval, unless there is a unit.
+    unit
+        What stands beside it; a unit of something else makes it another number.
     """
-    if not (np.isfinite(value) and value > 0):
+    called = "_".join(name.lower().split())
+    rate = called in RATE_NAMES
+    if not (np.isfinite(value) and value > 0) or not (rate or called in INTERVAL_NAMES):
         return None
-    if name.lower() in INTERVAL_NAMES:
-        return value
-    return 1 / value if name.lower() in RATE_NAMES else None
+    unit = "Hz" if unit.lower() in _PER_SECOND else unit
+    scale = factor(unit, "Hz" if rate else "s") if known(unit) else 1.0
+    if scale is None:
+        return None
+    return 1 / (value * scale) if rate else value * scale
+
+
+def since_1970(time: Array, *, seconds: bool) -> tuple[Array, str] | None:
+    """Seconds since the first of times that count from 1970, and what they count.
+
+    Parameters
+    ----------
+    time
+        As they stand in a file that names no unit, shape ``(time,)``.
+    seconds
+        Whether times in seconds are looked for as well: by themselves they are right as they are.
+
+    Returns
+    -------
+    tuple or None
+        None where their size is that of other times.
+    """
+    low, high = _SINCE_1970
+    if not len(time) or not np.isfinite(time).all():
+        return None
+    for word, count in (({"seconds": 1.0} if seconds else {}) | _COUNTS).items():
+        if low * count <= time.min() and time.max() < high * count:
+            return (time - time[0]) / count, word
+    return None
 
 
 def uniform_times(path: Path, count: int, step: float) -> Array:

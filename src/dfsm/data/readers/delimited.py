@@ -3,7 +3,8 @@
 The header is the first line that names a time; lines above it may say anything, and lines that
 begin with ``#``, ``%`` or ``!`` are comments (NumPy's ``savetxt`` writes the header as one). Units
 stand in the header as ``PtfmPitch [deg]``, or in a row of their own below it. Without a time there
-may be a column or a comment that tells the rate: ``fs = 50``, ``Ts``, ``dt``.
+may be a column, a comment or a line above that tells the rate: ``fs = 50``, ``Ts``, ``dt [ms]``.
+Numbers may have decimal commas, see `dfsm.data.readers.decimals`.
 """
 
 from __future__ import annotations
@@ -18,15 +19,18 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
+    ALSO_TIME,
     SECONDS,
     TIME_NAMES,
     kept_columns,
     no_time,
     rate_step,
+    since_1970,
     split_header,
     time_column,
     uniform_times,
 )
+from dfsm.data.readers.decimals import with_points
 from dfsm.data.readers.guard import unguarded
 from dfsm.data.readers.stamps import is_stamp
 from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
@@ -36,10 +40,17 @@ from dfsm.errors import DfsmError
 _COMMENTS = ("#", "%", "!")
 _HEADER_LINES = 200
 _BLANKS = ""  # the separator of columns that blanks separate
-_STAMP_NAMES = ("timestamp", "datetime", "date", "date time", "date_time")
+_STAMP_NAMES = (
+    *("timestamp", "datetime", "date", "date time", "date_time", "date/time", "datum"),
+    "zeitstempel",
+)
 _NAME_AND_UNIT = re.compile(r"\S+?[ _]?(?:\([^()]*\)|\[[^\[\]]*\])|\S+")
 _UNITS = re.compile(r"\([^()]*\)|\[[^\[\]]*\]|\S+")
-_RATE = re.compile(r"(\w+)\s*[=:]\s*([-+.\deE]+)\s*(?:Hz|s|sec)?\s*[,;]?", re.IGNORECASE)
+_RATE = re.compile(
+    r"((?:[^\W\d]\w*[ _])?[^\W\d]\w*)\s*[=:,;\t]\s*([-+]?[.\d][.\deE+-]*) *([^\s,;]*)"
+)
+# What spreadsheets write above a table to say how its cells are separated.
+_SEPARATED = re.compile(r"sep=(.)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,7 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
     header = _find_header(lines)
     if header is None:
         raise DfsmError(f"{path} holds blank lines only: check that it is the right file")
-    rows = _rows(path, lines, header)
+    rows, commas = with_points(path, _rows(path, lines, header), header.separator)
     channels = [Channel(*split_header(unguarded(cell))) for cell in header.names]
     if rows and (units := _units_row(lines, rows[0], header, channels)):
         channels = [
@@ -79,7 +90,7 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
         ended=text.endswith("\n"),
         columns="columns",
         ragged=lambda row: _cure(row.cells, len(channels), header.separator),
-        wrong=_cure_cell,
+        wrong=lambda _: "correct it",
     )
     table = read_rows(rows, layout)
     columns = list(table.values.T)
@@ -88,6 +99,10 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
         told, rate, note = _uniform(path, lines[: header.at], channels, columns, step)
     else:
         told, rate, note = columns[time], time, ""
+        if counted := _counted(channels[time], told) if table.stamps is None else None:
+            told, what = counted
+            name = channels[time].name
+            note = f"'{name}' counts {what} since 1970: times are seconds since the first"
     keep, notes = kept_columns(path, channels, columns, rate)
     for j in table.words:
         if j in keep and rows:
@@ -96,7 +111,7 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
             notes.append(f"column '{channels[j].name}' left out: it holds words ('{example}')")
     if table.stamps is not None and time is not None:
         note = table.stamps.note(channels[time].name)
-    notes += [note] if note else []
+    notes += [text for text in (note, commas) if text]
     values = np.stack([columns[i] for i in keep], axis=1) if keep else np.empty((len(told), 0))
     return assemble(path, told, values, [channels[i] for i in keep], notes=(*table.notes, *notes))
 
@@ -107,10 +122,17 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
 def _find_header(lines: list[str]) -> _Header | None:
     """The line of the names: the first that names a time, else the first that is no comment."""
     seen = [(i, line) for i, line in enumerate(lines[: 5 * _HEADER_LINES]) if line.strip()]
+    told = _SEPARATED.fullmatch(seen[0][1].strip(' \t\r"')) if seen else None
+    if told:
+        seen = seen[1:]
+    separators = told[1] if told else ",;\t"
     plain = [(i, line) for i, line in seen[:_HEADER_LINES] if not _is_comment(line)]
+    while len(plain) > 1 and _tells_rate(plain[0][1]):
+        del plain[0]
     for i, line in seen[:_HEADER_LINES]:
         comment = _is_comment(line)
-        header = _header(i, line.lstrip(" " + "".join(_COMMENTS)) if comment else line)
+        names = line.lstrip(" " + "".join(_COMMENTS)) if comment else line
+        header = _header(i, names, separators)
         if not _names_time(header.names):
             continue
         first = plain and i == plain[0][0] and not comment
@@ -118,14 +140,25 @@ def _find_header(lines: list[str]) -> _Header | None:
         # A sentence may hold the word as well, but no row of as many cells stands below it.
         if first or (below and len(_cells(below, header.separator)) == len(header.names)):
             return header
-    return _header(*plain[0]) if plain else None
+    return _header(*plain[0], separators) if plain else None
 
 
-def _header(at: int, line: str) -> _Header:
-    separator = max(",;\t", key=line.count)
+def _header(at: int, line: str, separators: str) -> _Header:
+    separator = max(separators, key=line.count)
     if separator in line:
         return _Header(at, separator, _cells(line, separator))
     return _Header(at, _BLANKS, _NAME_AND_UNIT.findall(line))
+
+
+def _tells_rate(line: str) -> bool:
+    match = _RATE.fullmatch(line.strip(" ,;\t"))
+    return match is not None and _rate_of(match) is not None
+
+
+def _rate_of(match: re.Match[str]) -> float | None:
+    """Interval in s that ``fs = 50 Hz`` and the like tell; None for other words and numbers."""
+    words, value = match[1].split(" "), number(match[2]) or 0.0
+    return rate_step(match[1], value, match[3]) or rate_step(words[-1], value, match[3])
 
 
 def _is_comment(line: str) -> bool:
@@ -133,7 +166,7 @@ def _is_comment(line: str) -> bool:
 
 
 def _names_time(names: list[str]) -> bool:
-    known = (*TIME_NAMES, *_STAMP_NAMES)
+    known = (*TIME_NAMES, *ALSO_TIME, *_STAMP_NAMES)
     return any(split_header(name)[0].lower() in known for name in names)
 
 
@@ -172,7 +205,7 @@ def _units_row(
         return None
     bracketed = any(re.fullmatch(r"\s*(\(.*\)|\[.*\])\s*", c) for c in cells)
     seconds = any(
-        c.name.lower() in TIME_NAMES and u.strip() and u.strip().lower() in SECONDS
+        c.name.lower() in (*TIME_NAMES, *ALSO_TIME) and u.strip() and u.strip().lower() in SECONDS
         for c, u in zip(channels, cells, strict=True)
     )
     return cells if bracketed or seconds else None
@@ -188,13 +221,23 @@ def _bare(unit: str) -> str:
 def _time(path: Path, channels: list[Channel], rows: list[Row]) -> int | None:
     """The column of the time or of time stamps; None where there is neither."""
     first = rows[0].cells if rows else []
-    for names in (TIME_NAMES, _STAMP_NAMES):
+    for names in (TIME_NAMES, ALSO_TIME, _STAMP_NAMES):
         for i, channel in enumerate(channels):
             if channel.name.lower() in names and i < len(first) and is_stamp(first[i]):
                 return i
-    if any(c.name.lower() in TIME_NAMES for c in channels):
+    if any(c.name.lower() in (*TIME_NAMES, *ALSO_TIME) for c in channels):
         return time_column(path, channels)
+    for i, channel in enumerate(channels):
+        if channel.name.lower() in _STAMP_NAMES and i < len(first):
+            counts = np.array([np.nan if (value := number(first[i])) is None else value])
+            if since_1970(counts, seconds=True):
+                return i
     return None
+
+
+def _counted(channel: Channel, time: Array) -> tuple[Array, str] | None:
+    """Times that count from 1970 in a column whose unit nobody states."""
+    return None if channel.unit else since_1970(time, seconds=channel.name.lower() in _STAMP_NAMES)
 
 
 def _uniform(
@@ -212,14 +255,14 @@ def _uniform(
     for j, values in enumerate(columns) if step is None else ():
         finite = values[np.isfinite(values)]
         if len(finite) and finite.min() == finite.max():
-            step = rate_step(channels[j].name, float(finite[0]))
+            step = rate_step(channels[j].name, float(finite[0]), channels[j].unit)
             if step is not None:
                 at, source = j, f"stands in column '{channels[j].name}'"
                 break
     for line in above if step is None else ():
-        for name, value in _RATE.findall(line):
-            step = rate_step(name, number(value) or 0.0) if step is None else step
-            source = "stands in a comment"
+        for match in _RATE.finditer(line):
+            step = _rate_of(match) if step is None else step
+            source = "stands in a comment" if _is_comment(line) else "stands above the table"
     if step is None:
         raise no_time(path, channels)
     note = f"there is no time column: samples every {step:g} s, which {source}"
@@ -235,9 +278,3 @@ def _cure(row: list[str], columns: int, separator: str) -> str:
     if separator == "," and whole and columns < len(row) <= 2 * columns:
         return "if its decimals have commas, save it with points; else correct or remove the line"
     return "correct or remove the line"
-
-
-def _cure_cell(text: str) -> str:
-    if re.fullmatch(r"[-+]?\d*,\d*(e[-+]?\d+)?", text, re.IGNORECASE):
-        return "decimals have a comma here, save the table with points"
-    return "correct it"
