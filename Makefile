@@ -3,7 +3,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Modules are compiled when they are first imported: of all that is installed, a few are.
+# Modules are compiled when they are first imported: of all that is installed, a few are. Kept they
+# are whatever the environment says, or every process would compile the same thousands again.
+export PYTHONDONTWRITEBYTECODE :=
 PIP_OPTIONS := --quiet --disable-pip-version-check --no-compile
 # Long files first, each file in one process: its models are fitted once.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder

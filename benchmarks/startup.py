@@ -63,6 +63,9 @@ COMMANDS: dict[str, list[str]] = {
     "dfsm validate, two runs": ["validate", "model", *map(str, TEST), "-o", "report.html"],
     "dfsm optimize, 1000 nodes": ["optimize", "problem.yaml", "-o", "optimum"],
 }
+# What the environment of whoever measures must not decide: without bytecode that is kept, every
+# process compiles all modules that it imports.
+_SETTINGS = ("JAX_", "XLA_", "PYTHONDONTWRITEBYTECODE")
 # An optimum that rests on a bound that a rollout just oversteps ends with 1.
 _FINE = (0, 1)
 
@@ -97,7 +100,7 @@ def run(before: str | None = None) -> dict[str, Any]:
 
 def seconds(place: Path, build: Path, command: Sequence[str], cache: str) -> float:
     """Processor time, user and system, of one command in a process of its own."""
-    own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    own = {k: v for k, v in os.environ.items() if not k.startswith(_SETTINGS)}
     environment = own | {"PYTHONPATH": str(build / "src"), "DFSM_CACHE": cache}
     process = subprocess.Popen(
         [sys.executable, "-m", "dfsm", *command],

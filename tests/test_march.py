@@ -5,6 +5,7 @@ The reference is the single run, which other tests hold against solve_ivp and cl
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -79,12 +80,31 @@ def test_a_batch_too_large_for_the_memory_is_split(monkeypatch):
     meshes = [mesh_of(RUNS[i % 2].select(MODEL.signals.exogenous), None, "linear")
               for i in range(7)]  # fmt: skip
     assert [sorted(rows) for rows in march._batches(MODEL, meshes)] == [list(range(7))]
-    # Two inputs, two states, one output, and two more numbers a sample; room for three runs.
-    monkeypatch.setattr(march, "_ASSUMED", 3 * 8 * 7 * march.padded(61, march._FEWEST_SAMPLES))
+    # Two inputs, two states, one output, and two more numbers a sample, twice; room for three runs.
+    monkeypatch.setattr(march, "_ASSUMED", 3 * 2 * 8 * 7 * march.padded(61, march._FEWEST_SAMPLES))
     split = list(march._batches(MODEL, meshes))
     assert sorted(len(rows) for rows in split) == [2, 2, 3]
     # Runs of one length stand together, and none is lost.
     assert [i for rows in split for i in rows] == [1, 3, 5, 0, 2, 4, 6]
+
+
+def test_a_batch_that_the_device_refuses_is_halved(monkeypatch):
+    alone = [simulate(MODEL, one) for one in RUNS]
+    real, tried = march._march_batch, []
+
+    def with_room_for_two(model, cases, pool=None):
+        tried.append(len(cases))
+        if len(cases) > 2:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+        return real(model, cases, pool)
+
+    monkeypatch.setattr(march, "in_batches", lambda: True)
+    monkeypatch.setattr(march, "_march_batch", with_room_for_two)
+    for result, single in zip(simulate(MODEL, RUNS), alone, strict=True):
+        np.testing.assert_allclose(
+            result.trajectory.values, single.trajectory.values, rtol=0, atol=1e-11
+        )
+    assert tried == [4, 2, 2]
 
 
 def test_few_sizes_are_compiled():

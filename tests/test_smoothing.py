@@ -168,14 +168,14 @@ def test_units_scale_results_and_nothing_else(value_scale, time_scale, shift):
 
 def test_degrees_of_freedom_are_the_trace_of_the_smoother():
     t = np.cumsum(np.random.default_rng(5).uniform(0.5, 1.5, 80))
-    level = _Mesh(t).levels[0]
+    level = _Mesh(t).level(0)
     for lam in (1e-2, 1.0, 1e4):
         columns = [e - level.fit(e, lam)[1] for e in np.eye(len(t))]
         assert level.degrees_of_freedom(lam) == pytest.approx(np.trace(columns), rel=1e-4)
 
 
 def test_the_penalty_is_the_integral_of_the_squared_third_derivative():
-    level = _Mesh(np.cumsum(np.random.default_rng(6).uniform(0.5, 1.5, 12))).levels[0]
+    level = _Mesh(np.cumsum(np.random.default_rng(6).uniform(0.5, 1.5, 12))).level(0)
     c = np.random.default_rng(7).normal(size=level.size)
     third = BSpline(level.knots, c, 5).derivative(3)
     exact = sum(

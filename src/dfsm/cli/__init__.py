@@ -6,6 +6,7 @@ input · 3 a bug in dfsm · 130 interrupted.
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import signal
@@ -53,6 +54,9 @@ from dfsm.cli.tune import tune
 from dfsm.cli.wind import wind
 from dfsm.core.progress import show_progress
 from dfsm.errors import DfsmError, DfsmWarning, printable
+
+# Objects that may be made before the interpreter looks for cycles among them.
+_SELDOM = 50_000
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -340,6 +344,8 @@ def two_link_robot(
 
 def main() -> None:
     """Run the command line; the only place that turns errors into exit codes."""
+    # What imports and traces leave is kept to the end; looking through it for cycles finds none.
+    gc.set_threshold(_SELDOM)
     # Ended by a queue or a service manager, a command cleans up as after Ctrl-C.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -319,24 +319,29 @@ class _Mesh:
         self.h = float(time[-1] - time[0]) / (len(time) - 1)
         self.x = (time - time[0]) / self.h
         self.finest = float(np.diff(self.x).min())
-        self.levels = [_Level(self.x, self.x)]
-        while True:
-            spacing = self.finest * _THINNING ** len(self.levels)
-            sites = _spaced(self.x, spacing)
-            if len(sites) < MIN_SAMPLES:
-                break
-            self.levels.append(_Level(self.x, sites))
+        sites = self.x
+        self._sites: list[Array] = []
+        while len(sites) >= MIN_SAMPLES:
+            self._sites.append(sites)
+            sites = _spaced(self.x, self.finest * _THINNING ** len(self._sites))
+        self._levels: dict[int, _Level] = {}
+
+    def level(self, k: int) -> _Level:
+        """Made when it is needed: a known noise level ends the walk above the finest."""
+        if k not in self._levels:
+            self._levels[k] = _Level(self.x, self._sites[k])
+        return self._levels[k]
 
     def path(self) -> Iterator[tuple[_Level, float]]:
         """Levels and λ from a parabola to interpolation, equally spaced in log λ."""
-        for k in reversed(range(len(self.levels))):
+        for k in reversed(range(len(self._sites))):
             spacing = self.finest * _THINNING**k
             # The coarsest level has nothing above it and goes on to where a parabola is left.
-            heavy = _HEAVY * (2.0 if k == len(self.levels) - 1 else 1.0)
+            heavy = _HEAVY * (2.0 if k == len(self._sites) - 1 else 1.0)
             light = _KEEP if k > 0 else _LIGHT
             count = round(_STEPS * np.log(heavy / light) / np.log(_THINNING))
             for j in range(count):
-                yield self.levels[k], (spacing * heavy * _THINNING ** (-j / _STEPS)) ** 6
+                yield self.level(k), (spacing * heavy * _THINNING ** (-j / _STEPS)) ** 6
 
 
 @lru_cache(maxsize=1)

@@ -10,10 +10,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import scipy
 
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
+from dfsm.numerics.filters import decimated
 from dfsm.numerics.spectra import Band, Spectrum
 from dfsm.report.blobs import Blobs
 from dfsm.report.first_screen import scores
@@ -79,8 +79,7 @@ def thin(run: Trajectory) -> tuple[float, float, Array]:
         return float(time[0]), step * factor, values[::factor]
     # A zero-phase low-pass before decimation keeps fast content from showing up as a slow wave;
     # the odd extension keeps the ends where they are.
-    thinned = scipy.signal.resample_poly(values, 1, factor, axis=0, padtype="antireflect")
-    return float(time[0]), step * factor, thinned
+    return float(time[0]), step * factor, decimated(values, factor)
 
 
 def _model(name: str, validation: Validation, blobs: Blobs) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 Inputs are interpolated and states kept where the loop runs; outputs and the check of the training
 region follow in parts that fit the memory. On a processor every run is a batch of its own, one
 thread per core; an accelerator takes as many runs at once as its memory holds, while the next are
-prepared and the last are judged in threads of the host.
+prepared and the last are judged in threads of the host. For these, every run is one piece of
+memory: arrays are turned from run first to time first, and back, where that costs least.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ _SIZES = 8
 _FEWEST_SAMPLES = 1024
 # Runs in one batch: beyond, an accelerator gains nothing, and its host waits.
 _MOST_RUNS = 4096
-# Share of the free memory for one batch; the one before is still there when the next begins.
-_SHARE = 0.3
+# Share of the free memory for one batch; the one before is still there when the next begins. Its
+# arrays are there twice, as they come and go and time first.
+_SHARE, _COPIES = 0.3, 2
 # Where a device does not say how much memory it has, bytes for one batch.
 _ASSUMED = 2**30
 # Samples whose outputs are computed at once: activations of hundreds of units stay in a core's
@@ -49,14 +51,14 @@ class _Batch(NamedTuple):
     x0, psi0
         Initial states ``(run, state)`` and azimuths in rad ``(run,)``.
     intervals
-        Between samples, in s, ``(sample - 1, run)``; zero changes nothing.
+        Between samples, in s, ``(run, sample - 1)``; zero changes nothing.
     values
-        Inputs at the samples, ``(sample, run, exogenous)``.
+        Inputs at the samples, ``(run, sample, exogenous)``.
     bends
         Coefficients of the powers three to one of the inputs that are splines,
-        ``(3, sample - 1, run, spline)``.
+        ``(run, 3, sample - 1, spline)``.
     field
-        Harmonics of the wind field at the samples, ``(sample, run, channel)``.
+        Harmonics of the wind field at the samples, ``(run, sample, channel)``.
     """
 
     x0: Array
@@ -115,10 +117,17 @@ def in_batches() -> bool:
     On a processor XLA keeps a loop on one core, and a single run stays in its cache where a batch
     does not.
     """
-    return jax.default_backend() != "cpu"
+    return _device().platform != "cpu"
+
+
+def _device() -> jax.Device:
+    """Where JAX computes; `jax.default_device` may say so."""
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return chosen if isinstance(chosen, jax.Device) else jax.devices(chosen)[0]
 
 
 _Results = tuple[Array, Array, Array]
+_Sent = tuple[jax.Array, ...] | jax.errors.JaxRuntimeError
 
 
 def _one(model: DFSM, case: Case[Mesh]) -> Rollout:
@@ -127,7 +136,7 @@ def _one(model: DFSM, case: Case[Mesh]) -> Rollout:
 
 
 def _rollout(results: _Results, mesh: Mesh, run: int) -> Rollout:
-    states, outputs, outside = (part[: len(mesh.time), run] for part in results)
+    states, outputs, outside = (part[run, : len(mesh.time)] for part in results)
     return Rollout(states, outputs, outside, True)
 
 
@@ -138,14 +147,45 @@ def _ahead(
     pool: ThreadPoolExecutor,
 ) -> Iterator[tuple[list[int], _Results]]:
     """Batches and their results; each is under way before the one before it is read."""
-    before: tuple[list[int], tuple[jax.Array, ...]] | None = None
-    for rows in _batches(model, meshes):
-        now = rows, _march_batch(model, list(pool.map(case, rows)), pool)
+    before: tuple[list[int], _Sent] | None = None
+    for rows in [*_batches(model, meshes), None]:
+        now = None if rows is None else (rows, _sent(model, case, pool, rows))
         if before is not None:
-            yield before[0], tuple(map(np.asarray, before[1]))  # pyright: ignore[reportReturnType]
+            yield from _read(model, case, pool, *before)
         before = now
-    if before is not None:
-        yield before[0], tuple(map(np.asarray, before[1]))  # pyright: ignore[reportReturnType]
+
+
+def _sent(
+    model: DFSM, case: Callable[[int], Case[Mesh]], pool: ThreadPoolExecutor, rows: list[int]
+) -> _Sent:
+    """What a batch will give, or why the device does not take it."""
+    try:
+        return _march_batch(model, list(pool.map(case, rows)), pool)
+    except jax.errors.JaxRuntimeError as error:
+        return error
+
+
+def _read(
+    model: DFSM,
+    case: Callable[[int], Case[Mesh]],
+    pool: ThreadPoolExecutor,
+    rows: list[int],
+    sent: _Sent,
+) -> Iterator[tuple[list[int], _Results]]:
+    """Results of a batch, or of its halves where the device had no memory for it after all."""
+    results = None
+    try:
+        if isinstance(sent, jax.errors.JaxRuntimeError):
+            raise sent
+        results = tuple(map(np.asarray, sent))
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error) or len(rows) == 1:
+            raise
+    if results is not None:
+        yield rows, results  # pyright: ignore[reportReturnType]
+        return
+    for half in (rows[: len(rows) // 2], rows[len(rows) // 2 :]):
+        yield from _read(model, case, pool, half, _sent(model, case, pool, half))
 
 
 def _batches(model: DFSM, meshes: Sequence[Mesh]) -> Iterator[list[int]]:
@@ -159,7 +199,7 @@ def _batches(model: DFSM, meshes: Sequence[Mesh]) -> Iterator[list[int]]:
         longest = meshes[rows[-1]]
         splines = 3 * len(_kind(longest).splines)
         wide = 2 + len(s.exogenous) + splines + len(s.states) + len(s.outputs) + len(s.field)
-        each = 8 * wide * padded(len(longest.time), _FEWEST_SAMPLES)
+        each = 8 * _COPIES * wide * padded(len(longest.time), _FEWEST_SAMPLES)
         most = min(_MOST_RUNS, max(1, int(_SHARE * _free_memory()) // each))
         parts = -(-len(rows) // most)
         for part in np.array_split(np.array(rows), parts):
@@ -168,7 +208,7 @@ def _batches(model: DFSM, meshes: Sequence[Mesh]) -> Iterator[list[int]]:
 
 def _free_memory() -> float:
     """Bytes that the device has left."""
-    told = jax.devices()[0].memory_stats() or {}
+    told = _device().memory_stats() or {}
     if "bytes_limit" not in told:
         return _ASSUMED / _SHARE
     return told["bytes_limit"] - told.get("bytes_in_use", 0)
@@ -188,50 +228,55 @@ def _kind(mesh: Mesh) -> _Kind:
 def _march_batch(
     model: DFSM, cases: Sequence[Case[Mesh]], pool: ThreadPoolExecutor | None = None
 ) -> tuple[jax.Array, ...]:
-    """States, outputs and what is outside, ``(sample, run, ...)``, padded; under way only."""
+    """States, outputs and what is outside, ``(run, sample, ...)``, padded; under way only."""
     longest = max(len(c.drive.time) for c in cases)
     samples, runs = padded(longest, _FEWEST_SAMPLES), padded(len(cases))
     kind, x0 = _kind(cases[0].drive), cases[0].x0
     batch = _Batch(
         x0=np.tile(x0, (runs, 1)),
         psi0=np.zeros(runs),
-        intervals=np.zeros((samples - 1, runs)),
-        values=np.zeros((samples, runs, cases[0].drive.values.shape[1])),
-        bends=np.zeros((3, samples - 1, runs, len(kind.splines))),
-        field=np.zeros((samples, runs, cases[0].field.shape[1])),
+        intervals=np.zeros((runs, samples - 1)),
+        values=np.zeros((runs, samples, cases[0].drive.values.shape[1])),
+        bends=np.zeros((runs, 3, samples - 1, len(kind.splines))),
+        field=np.zeros((runs, samples, cases[0].field.shape[1])),
     )
 
     def put(k: int) -> None:
         c, n = cases[k], len(cases[k].drive.time)
         batch.x0[k], batch.psi0[k] = c.x0, c.psi0
-        batch.intervals[: n - 1, k] = np.diff(c.drive.time)
-        batch.values[:n, k], batch.field[:n, k] = c.drive.values, c.field
-        batch.values[n:, k] = c.drive.values[-1]
+        batch.intervals[k, : n - 1] = np.diff(c.drive.time)
+        batch.values[k, :n], batch.field[k, :n] = c.drive.values, c.field
+        batch.values[k, n:] = c.drive.values[-1]
         if kind.splines:
-            batch.bends[:, : n - 1, k] = c.drive.bends()
+            batch.bends[k, :, : n - 1] = c.drive.bends()
 
-    # The runs beside the last are copies of it: what is computed of them goes nowhere.
     for _ in (map if pool is None else pool.map)(put, range(len(cases))):
         pass
-    batch.values[:, len(cases) :] = batch.values[:, :1]
-    block = _SEEN_AT_ONCE if in_batches() else _SEEN
-    rows = min(samples, max(1, block // runs))
-    counts = np.array([longest - 1, cases[0].drive.every], dtype=np.int64)
-    return _march(model, batch, counts, kind, rows)
+    # The runs beside the last are copies of one: what is computed of them goes nowhere.
+    batch.values[len(cases) :] = batch.values[0]
+    every = np.asarray(cases[0].drive.every)
+    if not in_batches():
+        rows = min(samples, max(1, _SEEN // runs))
+        return _march(model, batch, (np.asarray(longest - 1), every), kind, rows)
+    # A loop whose end an accelerator must look up waits for the host after every turn.
+    rows = min(samples, max(1, _SEEN_AT_ONCE // runs))
+    return _march(model, batch, (samples - 1, every), kind, rows)
 
 
 @eqx.filter_jit
 def _march(
-    model: DFSM, batch: _Batch, counts: IntArray, kind: _Kind, rows: int
+    model: DFSM, batch: _Batch, counts: tuple[int | IntArray, IntArray], kind: _Kind, rows: int
 ) -> tuple[jax.Array, ...]:
     """All runs along all intervals; `counts` are those and the steps in each, `rows` see `_along`.
 
-    Both counts are arguments of the compiled code, not part of it.
+    A count that is an array is an argument of the compiled code, not part of it.
     """
     model = model.prepared()
+    count, every = counts[0], jnp.asarray(counts[1])
     x0, psi0, intervals, values, bends, field = map(jnp.asarray, batch)
-    count, every = jnp.asarray(counts)
-    interval = jax.vmap(partial(_interval, model, kind, every), in_axes=(0, 0, 0, 0, 0, 1))
+    bends = jnp.moveaxis(bends, 2, 0)
+    intervals, values, field = (jnp.swapaxes(part, 0, 1) for part in (intervals, values, field))
+    interval = jax.vmap(partial(_interval, model, kind, every))
     xs = jnp.zeros((len(values), *x0.shape)).at[0].set(x0)
     psis = None
     if model.signals.azimuth_rate is not None:
@@ -239,11 +284,12 @@ def _march(
 
     def on(k: jax.Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         x, psi, xs, psis = carry
-        x, psi = interval(x, psi, intervals[k], values[k], values[k + 1], bends[:, k])
+        x, psi = interval(x, psi, intervals[k], values[k], values[k + 1], bends[k])
         return x, psi, xs.at[k + 1].set(x), None if psis is None else psis.at[k + 1].set(psi)
 
     _, _, xs, psis = jax.lax.fori_loop(0, count, on, (x0, psi0, xs, psis))
-    return xs, *_along(partial(seen, model), (xs, values, field, psis), count, rows)
+    found = _along(model, (xs, values, field, psis), count, rows)
+    return tuple(jnp.swapaxes(part, 0, 1) for part in (xs, *found))
 
 
 def _interval(
@@ -281,23 +327,25 @@ def _interval(
 
 
 def _along(
-    see: Callable[..., tuple[jax.Array, jax.Array]],
+    model: DFSM,
     paths: tuple[jax.Array, jax.Array, jax.Array, jax.Array | None],
-    count: jax.Array,
+    count: int | IntArray,
     rows: int,
-) -> tuple[jax.Array, ...]:
+) -> tuple[jax.Array, jax.Array]:
     """Outputs and the region's check along paths ``(sample, run, ...)``, `rows` samples at once."""
-    each, samples = jax.vmap(jax.vmap(see)), paths[0].shape[0]
-    shapes = jax.eval_shape(each, *paths)
-    found = tuple(jnp.zeros(part.shape, part.dtype) for part in shapes)
+    see = jax.vmap(jax.vmap(partial(seen, model)))
+    places = paths[0].shape[:2]
+    outputs = jnp.zeros((*places, len(model.signals.outputs)))
 
-    def on(k: jax.Array, found: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def on(k: jax.Array, found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         # The last part begins earlier than its place and does some samples again.
-        first = jnp.minimum(k * rows, samples - rows)
+        first = jnp.minimum(k * rows, places[0] - rows)
         part = [None if p is None else jax.lax.dynamic_slice_in_dim(p, first, rows) for p in paths]
-        return tuple(
+        outputs, outside = (
             jax.lax.dynamic_update_slice_in_dim(whole, new, first, 0)
-            for whole, new in zip(found, each(*part), strict=True)
+            for whole, new in zip(found, see(*part), strict=True)
         )
+        return outputs, outside
 
+    found = outputs, jnp.zeros(places, dtype=bool)
     return jax.lax.fori_loop(0, (count + rows) // rows, on, found)
