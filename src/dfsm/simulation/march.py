@@ -127,7 +127,7 @@ def _device() -> jax.Device:
 
 
 _Results = tuple[Array, Array, Array]
-_Sent = tuple[jax.Array, ...] | jax.errors.JaxRuntimeError
+_Sent = tuple[jax.Array, ...] | Exception
 
 
 def _one(model: DFSM, case: Case[Mesh]) -> Rollout:
@@ -175,7 +175,7 @@ def _read(
     """Results of a batch, or of its halves where the device had no memory for it after all."""
     results = None
     try:
-        if isinstance(sent, jax.errors.JaxRuntimeError):
+        if isinstance(sent, Exception):
             raise sent
         results = tuple(map(np.asarray, sent))
     except jax.errors.JaxRuntimeError as error:
@@ -343,7 +343,7 @@ def _along(
         part = [None if p is None else jax.lax.dynamic_slice_in_dim(p, first, rows) for p in paths]
         outputs, outside = (
             jax.lax.dynamic_update_slice_in_dim(whole, new, first, 0)
-            for whole, new in zip(found, see(*part), strict=True)
+            for whole, new in zip(found, see(*part), strict=True)  # pyright: ignore[reportArgumentType]
         )
         return outputs, outside
 
