@@ -120,10 +120,10 @@ def in_batches() -> bool:
     return _device().platform != "cpu"
 
 
-def _device() -> jax.Device:
+def _device() -> Any:
     """Where JAX computes; `jax.default_device` may say so."""
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return chosen if isinstance(chosen, jax.Device) else jax.devices(chosen)[0]
+    return jax.devices(chosen)[0] if chosen is None or isinstance(chosen, str) else chosen
 
 
 _Results = tuple[Array, Array, Array]
