@@ -80,7 +80,7 @@ def main() -> None:
             model, runs, deck, start=demo.START, measurements=MEASUREMENTS
         )
         article = closed_loop_article(validation, str(told.model), str(told.deck))
-        print_article(replace(article, sections=article.sections[:1]))
+        print_article(replace(article, sections=article.sections[:2]))
         if told.gains is not None:
             print_changes(model, deck, told.gains)
 

@@ -97,7 +97,7 @@ def closed_loop(
         print_json(validation.to_dict())
     elif not quiet:
         # The page tells each run.
-        print_article(replace(article, sections=article.sections[:1]))
+        print_article(replace(article, sections=article.sections[:2]))
         if kept := [n for n in surrogate.signals.names("controls") if n not in law.commands]:
             say(f"the controller does not set {', '.join(kept)}: as recorded", quiet)
         say(f"wrote {output} ({len(runs)} runs) and {figures}", quiet)

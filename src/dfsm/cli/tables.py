@@ -243,7 +243,7 @@ def print_check(check: RunCheck) -> None:
 def print_article(article: Article) -> None:
     """Print the tables of a study; texts and figures are in its page."""
     console = _console()
-    for section in article.sections:
+    for section in (s for s in article.sections if s.tables):
         console.print(Text(section.heading, style="bold underline"))
         for part in section.tables:
             console.print(Text(f"\n{part.caption}", style="italic"))

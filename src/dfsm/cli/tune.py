@@ -51,7 +51,7 @@ def tune(
         article = tuning_article(result)
         from dataclasses import replace
 
-        print_article(replace(article, sections=article.sections[:2]))
+        print_article(replace(article, sections=article.sections[:3]))
         say(f"wrote {output}{', going on with what it held' if known else ''}", quiet)
     if result.status in (TuneStatus.UNSTABLE, TuneStatus.INFEASIBLE, TuneStatus.INTERRUPTED):
         raise typer.Exit(1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dfsm.data.trajectory import Channel, Trajectory
@@ -34,12 +36,12 @@ def closed_loop_article(validation: ClosedLoopValidation, model: str, controller
         "start, beside the rollout along the recorded controls."
     )
     sections = [
+        Section("ratios", "Closed loop against the record", figures=_ratios(validation)),
         Section(
             "figures",
-            "Closed loop against the record",
+            "All runs",
             (about, *validation.endings()),
             (over_runs(validation),),
-            _ratios(validation),
         ),
         Section("runs", "Each run", tables=(_by_run(validation),)),
     ]
@@ -104,9 +106,9 @@ def over_runs(validation: ClosedLoopValidation) -> Table:
                     row.replay_nrmse,
                 )
             )
-    return Table(
+    table = Table(
         "over_runs",
-        "All runs: simulated over recorded",
+        "Simulated over recorded",
         (
             *("channel", "mean, recorded", "closed loop"),
             *("std", "std, worst", "std, replay"),
@@ -119,6 +121,7 @@ def over_runs(validation: ClosedLoopValidation) -> Table:
             f"of the open-loop replay; DEL with m = {SHOWN_EXPONENT}; NRMSE at equal times"
         ),
     )
+    return _filled(table)
 
 
 def _by_run(validation: ClosedLoopValidation) -> Table:
@@ -142,7 +145,7 @@ def _by_run(validation: ClosedLoopValidation) -> Table:
                     run.loop_errors[channel.name].nrmse,
                 )
             )
-    return Table(
+    table = Table(
         "by_run",
         "Each run: recorded, closed loop, open-loop replay",
         (
@@ -153,6 +156,17 @@ def _by_run(validation: ClosedLoopValidation) -> Table:
             "NRMSE",
         ),
         tuple(rows),
+    )
+    return _filled(table)
+
+
+def _filled(table: Table) -> Table:
+    """The table without columns that hold nothing, as loads do where no channel is one."""
+    kept = [j for j in range(len(table.columns)) if any(r[j] is not None for r in table.rows)]
+    return replace(
+        table,
+        columns=tuple(table.columns[j] for j in kept),
+        rows=tuple(tuple(row[j] for j in kept) for row in table.rows),
     )
 
 

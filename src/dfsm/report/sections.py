@@ -23,7 +23,8 @@ def completions(name: str, validation: Validation) -> Markup:
     span = f"{np.mean(durations):.0f} s" if np.ptp(durations) < 1 else "different lengths"
     tested = f"{plural(count, 'test run')} of {span}"
     if all(n == count for _, n in completed):
-        text = f"{name}: every variant completed {'its' if count == 1 else 'all'} {tested}."
+        all_of_them = f"the test run of {span}" if count == 1 else f"all {tested}"
+        text = f"{name}: every variant completed {all_of_them}."
     else:
         each = ", ".join(f"{m} {n} of {count}" for m, n in completed)
         text = f"{name}: completed, of {tested}: {each}."

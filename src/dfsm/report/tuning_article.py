@@ -9,7 +9,7 @@ import numpy as np
 from dfsm.data.trajectory import Trajectory
 from dfsm.loops.tuning_problem import Limit
 from dfsm.loops.tuning_result import TuningResult
-from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table
+from dfsm.report.article import Article, Curve, Figure, Panel, Section, Table, cell_text
 from dfsm.report.article_page import write_article
 from dfsm.report.dots import dots
 from dfsm.simulation.closed_loop import LoopStatus
@@ -27,7 +27,8 @@ def tuning_article(result: TuningResult) -> Article:
         f"{result.gradients} with slopes, in {result.seconds:.0f} s."
     )
     sections = [
-        Section("measures", "Before and after", (), (measures(result),), _changed(result)),
+        Section("changed", "Before and after", figures=_changed(result)),
+        Section("measures", "Measure by measure", tables=(measures(result),)),
         Section("parameters", "Parameters", (cost,), (_parameters(result),)),
         Section("runs", "Each run", tables=(_by_run(result),)),
     ]
@@ -46,9 +47,10 @@ def _verdict(result: TuningResult) -> str:
     before, after = result.before_objective, result.objective
     if np.isfinite([before, after]).all() and before:
         change = 100 * (after - before) / abs(before)
-        told = f"The objective goes from {before:.3g} to {after:.3g} ({change:+.0f} %)"
+        signed = f"{change:+.0f}".replace("-", "\N{MINUS SIGN}")
+        told = f"The objective goes from {cell_text(before)} to {cell_text(after)} ({signed} %)"
     else:
-        told = f"The objective is {after:.3g}; the controller as it was has no stable loop"
+        told = f"The objective is {cell_text(after)}, and was no number before"
     if result.problem.constraints:
         told += ", a limit is broken" if result.violation > 0 else ", all limits hold"
     return f"{told}. {result.message[:1].upper()}{result.message[1:]}."
