@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import dfsm as package
+from dfsm.data.features import Feature
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.exports.c_code import to_c
 from dfsm.exports.fmu import write_fmu
@@ -98,6 +99,18 @@ def test_exports_tell_the_step_and_where_hidden_states_start(tmp_path: Path):
     assert next(v.start for v in made.variables if v.name == "rk4_step") == pytest.approx(0.1)
     stiff = linear_model(np.array([[-30.0]]), np.array([[1.0]]))
     assert description(stiff)["step"] == pytest.approx(1.5 / 30)
+
+
+def test_a_delayed_input_is_told_where_it_must_be_supplied():
+    late = Feature(source="u9", kind="delay", seconds=2.5)
+    model = hidden("tanh")
+    controls = (model.signals.controls[0], Channel(late.name, "N"))
+    signals = replace(model.signals, controls=controls, features=(late,))
+    told = to_c(replace(model, signals=signals))
+    sentence = f"{late.name} (N) is u9 as it was 2.5 s ago: supply it"
+    assert told.description["computed_inputs"] == [sentence]
+    assert sentence in told.header
+    assert f"{late.name} (N), cubic between samples" in told.header
 
 
 def test_linearizations_hold_hidden_states():
