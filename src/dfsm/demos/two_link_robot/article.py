@@ -7,7 +7,7 @@ from typing import Any
 
 from dfsm.demos.two_link_robot import figures
 from dfsm.demos.two_link_robot.assess import Assessed
-from dfsm.demos.two_link_robot.claims import claims_section
+from dfsm.demos.two_link_robot.claims import claims_section, verdict
 from dfsm.demos.two_link_robot.defaults import PEER, PEER_SECONDS, Fitted
 from dfsm.demos.two_link_robot.extraction import Extraction
 from dfsm.demos.two_link_robot.multi_fidelity import MULTI, NONLINEAR, Chaos, MultiFidelity
@@ -28,18 +28,18 @@ def robot_article(study: RobotStudy) -> Article:
     study
         From `dfsm.demos.two_link_robot.study.study`.
     """
+    claims = claims_section(study)
     return Article(
         key=KEY,
         title="Two-link robots: the paper's study, and beyond",
-        lede=(
-            "Two robot arms whose equations are known, so that every error is known too. The arm "
-            "with gravity is the paper's; it is a double pendulum and chaotic. The arm in a "
-            "horizontal plane can be predicted for seconds and serves for long rollouts. Models "
-            "see simulations only. Sections, figures and claims are those of Sundarrajan and "
-            "Herber (IMECE 2023)."
-        ),
+        lede=verdict(claims),
         sections=(
-            claims_section(study),
+            Section(
+                "rollouts",
+                "One run, by every model",
+                figures=(figures.rollouts(study.multi_fidelity),),
+            ),
+            claims,
             extraction_section(study.extraction),
             taylor_section(study.taylor),
             multi_fidelity_section(study.multi_fidelity),
@@ -179,7 +179,7 @@ def multi_fidelity_section(m: MultiFidelity) -> Section:
     )
     return Section(
         "multi-fidelity",
-        "Multi-fidelity against nonlinear-only (Sec. 3.8.2, Figs. 4 to 6)",
+        "Multi-fidelity against nonlinear-only (Sec. 3.8.2, Figs. 4 and 6)",
         paragraphs=(
             "A hundred simulations of 3 s from states in (−1, 1)⁴ with torques through 90 random "
             "knots in (−1, 1), 900 samples each; eighty train, twenty test. The paper's recipe: "
@@ -188,7 +188,6 @@ def multi_fidelity_section(m: MultiFidelity) -> Section:
         tables=(accuracy, sweep),
         figures=(
             figures.corrected_rows(m),
-            figures.rollouts(m),
             figures.histograms(m),
             figures.sweep(m),
         ),

@@ -33,7 +33,24 @@ def claims_section(study: RobotStudy) -> Section:
         ("Claim", "Paper", "Here", "Holds"),
         rows,
     )
-    return Section("claims", "Do the paper's claims hold?", tables=(table,))
+    about = (
+        "Two robot arms whose equations are known, so that every error is known too. The arm "
+        "with gravity is the paper's; it is a double pendulum and chaotic. The arm in a "
+        "horizontal plane can be predicted for seconds and serves for long rollouts. Models see "
+        "simulations only. Sections, figures and claims are those of Sundarrajan and Herber "
+        "(IMECE 2023)."
+    )
+    return Section("claims", "Do the paper's claims hold?", (about,), (table,))
+
+
+def verdict(claims: Section) -> str:
+    """How many of the claims hold, in part, or not."""
+    told = [str(row[-1]) for row in claims.tables[0].rows]
+    yes, no = (sum(t.startswith(word) for t in told) for word in ("yes", "no"))
+    return (
+        f"Of {len(told)} claims of the paper {yes} hold, {len(told) - yes - no} hold in part and "
+        f"{no} do not."
+    )
 
 
 def _claim_extraction(study: RobotStudy) -> tuple[str, ...]:
