@@ -9,7 +9,6 @@ import pytest
 
 from conftest import Dfsm
 from dfsm.demos.two_link_robot.assess import hushed, roll
-from dfsm.demos.two_link_robot.claims import verdict
 from dfsm.demos.two_link_robot.multi_fidelity import draw, fit_settings
 from dfsm.fitting.corrective.rbf import RBF
 from dfsm.fitting.fit import fit
@@ -94,11 +93,3 @@ def test_texts_of_an_article_are_data_and_never_markup(tmp_path):
 def test_a_table_in_markdown():
     table = Table("t", "", ("name", "value"), (("a", 1.0), ("b", None)), digits=2)
     assert table.markdown() == ["| name | value |", "| --- | ---: |", "| a | 1.0 |", "| b | – |"]
-
-
-def test_claims_are_counted_in_the_first_sentence():
-    answers = ("yes", "yes, with the right poles", "a little", "in part", "no")
-    rows = tuple(("claim", "paper", "here", answer) for answer in answers)
-    table = Table("claims", "", ("Claim", "Paper", "Here", "Holds"), rows)
-    told = verdict(Section("claims", "Claims", tables=(table,)))
-    assert told == "Of 5 claims of the paper 2 hold, 2 hold in part and 1 do not."

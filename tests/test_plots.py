@@ -19,12 +19,9 @@ from dfsm.errors import DfsmError, hushed
 from dfsm.loops.adaptive import AdaptiveResult, Agreement, Realised, Round
 from dfsm.loops.load_cases import Figures
 from dfsm.loops.sweep import Sweep, Swept
-from dfsm.loops.tuning_problem import Goal, TuningProblem
 from dfsm.loops.tuning_result import TuneStatus, TuningResult
 from dfsm.models.summary import lines_of
-from dfsm.report.closed_loop_article import closed_loop_article
 from dfsm.report.result_figures import extremes
-from dfsm.report.tuning_article import tuning_article
 from dfsm.selection.compare import RankedCandidate, Ranking
 from dfsm.selection.trial import Outcome
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus
@@ -210,13 +207,13 @@ def test_comparisons_are_drawn_as_ratios_errors_and_rounds():
 def tuned():
     """A tuning whose loops are known."""
     run = solution().trajectory
-    goal = Goal(measure="std", channel="x")
-    problem = TuningProblem(parameters={"kp": (0.0, 1.0)}, objective=(goal,))
+    measure = SimpleNamespace(channel="x", label="std of x", weight=1.0)
+    problem: Any = SimpleNamespace(objective=(measure,), measures=(measure,), parameters={})
     after = ClosedLoopRun(run, LoopStatus.COMPLETED, 4.0, "", 0.0)
     before = replace(after, trajectory=replace(run, values=3 * run.values))
     return TuningResult(
-        problem, None, {"kp": 1.0}, {"kp": 0.5}, np.array([2.0]), np.array([4.0]), 2.0, 4.0, 0.0,
-        TuneStatus.SOLVED, (), (), (after,), (before,), {}, 1, 1, 0.1,
+        problem, None, {}, {}, np.array([2.0]), np.array([4.0]), 2.0, 4.0, 0.0, TuneStatus.SOLVED,
+        (), (), (after,), (before,), {}, 1, 1, 0.1,
     )  # fmt: skip
 
 
@@ -226,34 +223,6 @@ def test_a_tuning_is_drawn_before_and_after():
     np.testing.assert_array_equal(traces(figure, "tuned")[0].y, 1e5 + TIME)
     np.testing.assert_array_equal(traces(figure, "before")[0].y, 3 * (1e5 + TIME))
     assert "std of x" in Text(tuned()._repr_html_()).words
-
-
-def test_first_screens_hold_a_verdict_in_words_and_a_figure():
-    tuning = tuning_article(tuned())
-    assert tuning.lede.startswith("The objective goes from 4.00 to 2.00 (\N{MINUS SIGN}50 %). No ")
-    assert "kp at a bound" in tuning.lede
-    (panel,) = tuning.sections[0].figures[0].panels
-    assert {c.name: c.x.tolist() for c in panel.curves} == {"as it was": [1, 1], "tuned": [0.5]}
-    assert panel.ticks == ((0.0, "std of x"),)
-
-    row = dict.fromkeys(("damage_ratio", "damage_worst", "replay_damage_ratio"))
-    row |= dict.fromkeys(("recorded_mean", "mean", "std_worst", "replay_std_ratio"), 1.0)
-    row |= dict.fromkeys(("nrmse", "replay_nrmse"), 0.1)
-    rows = {n: SimpleNamespace(**row, std_ratio=v) for n, v in (("x", 0.5), ("y", 1.2))}
-    loops: Any = SimpleNamespace(
-        completed=1, runs=2 * [SimpleNamespace(loop_statistics={})],
-        channels=(Channel("x", "m"), Channel("y", "m")), endings=list, row=rows.get,
-    )  # fmt: skip
-    article = closed_loop_article(loops, "model", "pi")
-    assert article.lede == (
-        "1 of 2 closed loops came to their end. Their standard deviations are 0.50 (x) to 1.20 (y) "
-        "times those of the record."
-    )
-    (panel,) = article.sections[0].figures[0].panels
-    assert panel.curves[-1].x.tolist() == [0.5, 1.2]
-    # Nothing has a damage-equivalent load, so no column and no dot is kept for one.
-    assert not any("DEL" in head for head in article.sections[1].tables[0].columns)
-    assert [c.name for c in panel.curves] == ["as recorded", "standard deviation"]
 
 
 def test_print_draws_what_the_screen_draws(validation):
