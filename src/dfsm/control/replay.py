@@ -152,6 +152,8 @@ def _integrate(
             saveat=diffrax.SaveAt(ts=jnp.asarray(points[1:])),
             stepsize_controller=diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE),
             max_steps=_MOST_STEPS,
+            # Nobody differentiates backwards through it, and what that needs takes long to trace.
+            adjoint=diffrax.ForwardMode(),
             throw=False,
         )
         ys = jnp.asarray(solution.ys)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -120,13 +121,16 @@ def whiten(
         used = np.where(enough[:, None, None], others, total)
         W = np.stack([_whitening(s, order) for s in used])
         middles = used[:, 0, 1:] / used[:, :1, 0]
-        shares = hats(jnp.asarray(grid), jnp.asarray(z[mine, schedule or 0]))
-        squared = squared_distance(*map(jnp.asarray, (z[mine], shares, middles, W)))
-        distances.append(np.sqrt(squared))
+        distances.append(np.sqrt(_squared(z[mine], grid, z[mine, schedule or 0], middles, W)))
     by_group = np.argsort(groups, kind="stable")
     weights = None if weights is None else weights[by_group]
     reach = float(quantiles_over(np.concatenate(distances), _SHARE, weights))
     return np.stack([_whitening(s, order) for s in total]) / std, reach
+
+
+@jax.jit
+def _squared(z: Array, grid: Array, value: Array, middles: Array, W: Array) -> jax.Array:
+    return squared_distance(z, hats(grid, value), middles, W)
 
 
 def _groups(runs: IntArray) -> IntArray:

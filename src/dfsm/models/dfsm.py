@@ -10,7 +10,7 @@ through `derivative` and `output`, so simulation, Jacobians and optimization see
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -118,8 +118,7 @@ class DFSM(eqx.Module):
         """
         order = self.signals.order
         groups = order.arrays(states, controls, disturbances, parameters)
-        value = order.element(self.f.schedule, *groups)
-        return _evaluate(self, _derivative, order.join(*groups), value)
+        return _evaluate(self, _derivative, groups, self.f.schedule)
 
     def output(
         self,
@@ -155,14 +154,9 @@ class DFSM(eqx.Module):
         """
         order = self.signals.order
         groups = order.arrays(states, controls, disturbances, parameters)
-        inputs = order.join(*groups)
         if self.g is None:
-            return jnp.zeros((*inputs.shape[:-1], 0))
-        value = order.element(self.g.schedule, *groups)
-        harmonics = self._harmonics(azimuth, field)
-        shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
-        parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
-        return _evaluate(self, _output, jnp.concatenate(parts, axis=-1), value)
+            return jnp.zeros((*jnp.broadcast_shapes(*(a.shape[:-1] for a in groups)), 0))
+        return _evaluate(self, _output, groups, self.g.schedule, self._harmonics(azimuth, field))
 
     def _harmonics(self, psi: ArrayLike | None, field: ArrayLike | None) -> jax.Array:
         """What ĝ takes beside I, shape ``(..., harmonic)``; zero, its mean, without an azimuth."""
@@ -405,12 +399,23 @@ def _sum(
 
 
 @eqx.filter_jit
-def _evaluate(model: DFSM, row: Row, inputs: jax.Array, value: jax.Array) -> jax.Array:
-    """Evaluate `_derivative` or `_output` at inputs ``(..., input)``.
+def _evaluate(
+    model: DFSM,
+    row: Row,
+    groups: Sequence[jax.Array],
+    schedule: int | None,
+    harmonics: jax.Array | None = None,
+) -> jax.Array:
+    """Evaluate `_derivative` or `_output` at groups of inputs ``(..., n)``, and ĝ's harmonics.
 
-    `value` is the schedule's there, of a shape that broadcasts to ``(...)``.
+    All of it in one compiled function: each operation outside would be compiled by itself.
     """
-    model = model.prepared()
+    model, order = model.prepared(), model.signals.order
+    inputs, value = order.join(*groups), order.element(schedule, *groups)
+    if harmonics is not None:
+        shape = jnp.broadcast_shapes(inputs.shape[:-1], harmonics.shape[:-1])
+        parts = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in (inputs, harmonics)]
+        inputs = jnp.concatenate(parts, axis=-1)
     flat = inputs.reshape(-1, inputs.shape[-1])
     values = jnp.broadcast_to(value, inputs.shape[:-1]).ravel()
 

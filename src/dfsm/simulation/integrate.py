@@ -377,6 +377,8 @@ def _adapt(
             ends=bends[1],
         ),
         max_steps=_MAX_STEPS,
+        # Nobody differentiates backwards through it, and what that needs takes long to trace.
+        adjoint=diffrax.ForwardMode(),
         throw=False,
     )
     states = jnp.asarray(solution.ys) * spread

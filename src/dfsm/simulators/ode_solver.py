@@ -143,6 +143,8 @@ def _integrate(
         saveat=diffrax.SaveAt(ts=samples),
         stepsize_controller=controller,
         max_steps=_MAX_STEPS,
+        # Nobody differentiates backwards through it, and what that needs takes long to trace.
+        adjoint=diffrax.ForwardMode(),
         throw=False,
     )
     return jnp.asarray(solution.ys)

@@ -79,10 +79,10 @@ class NetworkError:
         """Put samples ``(sample, input)`` and ``(sample, target)`` into blocks."""
         blocks = -(-len(z) // _BLOCK)
         rows = np.arange(blocks * _BLOCK)
-        counts = jnp.asarray((rows < len(z)).astype(float)).reshape(blocks, _BLOCK)
+        counts = (rows < len(z)).astype(float).reshape(blocks, _BLOCK)
         rows = np.minimum(rows, len(z) - 1)
-        zs, ys = (jnp.asarray(a)[rows].reshape(blocks, _BLOCK, -1) for a in (z, targets))
-        return cls(sizes, zs, ys, counts)
+        zs, ys = (a[rows].reshape(blocks, _BLOCK, -1) for a in (z, targets))
+        return cls(sizes, jnp.asarray(zs), jnp.asarray(ys), jnp.asarray(counts))
 
     def cost(self, weights: Array) -> float:
         """Sum of the squared residuals r."""
