@@ -17,7 +17,7 @@ from dfsm.core.units import factor
 from dfsm.data.conversion import in_units_of, tell_converted
 from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError, missing, printable
-from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.numerics.fatigue import damage_by_exponent
 from dfsm.validation.results import ChannelError
 
 # Limits count as kept within this part of their size.
@@ -247,10 +247,7 @@ def _channel(predicted: Trajectory, actual: Trajectory, name: str) -> ChannelChe
 
 def _figures(run: Trajectory, name: str, is_load: bool) -> Figures:
     values = run[name]
-    damage = {
-        f"{m:g}": damage_equivalent_load(values, run.duration, m)
-        for m in (WOHLER_EXPONENTS if is_load else ())
-    }
+    damage = damage_by_exponent(values, run.duration) if is_load else {}
     mean = float(np.trapezoid(values, run.time)) / run.duration
     return Figures(float(values.min()), mean, float(values.max()), damage)
 

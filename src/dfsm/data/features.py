@@ -8,7 +8,7 @@ run's own channels in one way, for training, simulation and optimization alike.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -108,23 +108,42 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
         A source is missing or not finite, a lag is asked for on a mesh that is not equidistant,
         or the two of a difference have different units.
     """
+    added: dict[str, tuple[Channel, Array]] = {}
     for feature in features:
-        run.columns(feature.sources)
-        source, *others = run.select(feature.sources).require_finite().channels
+        made = _made_of(run, feature, added)
+        source, *others = made.channels
         if feature.kind == "rate":
-            values, unit = _rate(run, feature), per_second(source.unit)
+            values, unit = _rate(made, feature), per_second(source.unit)
         elif feature.kind == "lag":
-            values, unit = _lagged(run, feature), source.unit
+            values, unit = _lagged(made, feature), source.unit
         elif feature.seconds is not None:
-            values = np.interp(run.time - feature.seconds, run.time, run[source.name])
+            values = np.interp(made.time - feature.seconds, made.time, made[source.name])
             unit = source.unit
         else:
-            _require_one_unit(run, source, others[0])
-            values, unit = run[source.name] - run[others[0].name], source.unit
+            _require_one_unit(made, source, others[0])
+            values, unit = made[source.name] - made[others[0].name], source.unit
+        added.pop(feature.name, None)
         channel = Channel(feature.name, unit, role="disturbance", computed=True)
-        run = run.select(n for n in run.names if n != feature.name)
-        run = run.with_channels([channel], values)
-    return run
+        added[feature.name] = channel, values
+    if not added:
+        return run
+    # All at once: each copy of a whole run costs more than most features.
+    channels, values = zip(*added.values(), strict=True)
+    kept = [n for n in run.names if n not in added]
+    return run.select(kept).with_channels(list(channels), np.column_stack(values))
+
+
+def _made_of(
+    run: Trajectory, feature: Feature, added: Mapping[str, tuple[Channel, Array]]
+) -> Trajectory:
+    """The channels that a feature is made of, finite; those of features before it as they are."""
+    made = [added[name] for name in feature.sources if name in added]
+    part = run.select([name for name in feature.sources if name not in added])
+    if made:
+        channels, values = zip(*made, strict=True)
+        part = part.with_channels(list(channels), np.column_stack(values))
+        part = part.select(feature.sources)
+    return part.require_finite()
 
 
 def unknown_until(features: Iterable[Feature]) -> float:

@@ -12,7 +12,7 @@ from dfsm.core.settings import require
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.numerics.fatigue import damage_by_exponent
 
 HOURS_PER_YEAR = 8766.0
 
@@ -51,9 +51,7 @@ class Figures:
             minimum=float(values.min()),
             maximum=float(values.max()),
             travel=float(np.abs(np.diff(values)).sum() / duration),
-            damage={
-                f"{m:g}": damage_equivalent_load(values, duration, m) for m in WOHLER_EXPONENTS
-            },
+            damage=damage_by_exponent(values, duration),
         )
 
     @classmethod

@@ -235,6 +235,7 @@ def sweep(
             window=(settings.start, settings.stop),
             measurements=measurements,
             settings=settings.loop,
+            watched=False,
         )
     loops = dict(zip(controllers, rolled, strict=True))
     swept = tuple(_swept(n, loops[n], weights, settings, units) for n in controllers)

@@ -20,17 +20,22 @@ from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.loops.measures import Measure
-from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.closed_loop import (
-    PAD,
     ClosedLoopRun,
     LoopStatus,
     is_compiled,
     result_of,
 )
-from dfsm.simulation.loop import roll_compiled
-from dfsm.simulation.loop_cases import ClosedLoopSettings, LoopCase, padded, prepared_cases
+from dfsm.simulation.loop import Drive, outside_along, roll_compiled
+from dfsm.simulation.loop import Path as LoopPath
+from dfsm.simulation.loop_cases import (
+    ClosedLoopSettings,
+    LoopCase,
+    enough_calls,
+    padded,
+    prepared_cases,
+)
 from dfsm.simulation.loop_slopes import roll_with_slopes
 from dfsm.simulation.wires import connect
 
@@ -108,13 +113,13 @@ class Evaluator:
                 "differentiate it: write it as one, or tune ROSCO in JAX instead of a library"
             )
         self.model, self.tuned, self.measures = model, tuned, tuple(measures)
-        self.runs = all_completed(list(runs), model.signals)
         self.wires = connect(model, tuned.controller, measurements)
         settings = loop or ClosedLoopSettings()
         interval = float(tuned.controller.interval)
-        self.cases = prepared_cases(model, self.runs, interval, window, settings)
-        longest = max(len(c.drive.time) for c in self.cases) + 1
-        calls = -(-longest // PAD) * PAD
+        self.cases = prepared_cases(model, runs, interval, window, settings)
+        self.runs = [case.record for case in self.cases]
+        self._ready = model.prepared()
+        calls = enough_calls(*self.cases)
         self._drives = [padded(case, calls) for case in self.cases]
         self._controller = jax.tree.map(jnp.asarray, tuned.controller)
         self._known: dict[tuple[float, ...], Figured] = {}
@@ -162,10 +167,13 @@ class Evaluator:
         """The closed loops themselves at a point."""
         controller = self.tuned.at(theta)
         numbers = jax.tree.map(jnp.asarray, controller)
+
+        def rolled(drive: Drive) -> LoopPath:
+            path = roll_compiled(self._ready, self.wires, numbers, drive)
+            return path._replace(outside=outside_along(self.model, drive, path))
+
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            paths = list(
-                pool.map(lambda d: roll_compiled(self.model, self.wires, numbers, d), self._drives)
-            )
+            paths = list(pool.map(rolled, self._drives))
         return [
             result_of(self.model, self.wires, controller, case, path)
             for case, path in zip(self.cases, paths, strict=True)
@@ -178,9 +186,12 @@ class Evaluator:
         case, drive = self.cases[i], self._drives[i]
         controller, moved = self._controller, None
         if ways is None:
-            path = roll_compiled(self.model, self.wires, with_numbers(controller, numbers), drive)
+            with_these = with_numbers(controller, numbers)
+            path = roll_compiled(self._ready, self.wires, with_these, drive)
         else:
-            path, moved = roll_with_slopes(self.model, self.wires, controller, numbers, ways, drive)
+            path, moved = roll_with_slopes(
+                self._ready, self.wires, controller, numbers, ways, drive
+            )
         ended = result_of(self.model, self.wires, controller, case, path)
         nothing = np.full((len(self.measures), len(self.tuned.names)), np.nan)
         if ended.status is not LoopStatus.COMPLETED:

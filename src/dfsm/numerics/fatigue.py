@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import fatpack
 import numpy as np
 
@@ -38,6 +40,20 @@ def damage_equivalent_load(
     DfsmError
         A sample is NaN or infinite, there are none, or no time has passed.
     """
+    return _damage_equivalent_loads(values, duration, [exponent], frequency)[0]
+
+
+def damage_by_exponent(
+    values: Series, duration: float, exponents: Sequence[float] = WOHLER_EXPONENTS
+) -> dict[str, float]:
+    """`damage_equivalent_load` by exponent as it is written; cycles are counted once."""
+    loads = _damage_equivalent_loads(values, duration, exponents, 1.0)
+    return {f"{m:g}": load for m, load in zip(exponents, loads, strict=True)}
+
+
+def _damage_equivalent_loads(
+    values: Series, duration: float, exponents: Sequence[float], frequency: float
+) -> list[float]:
     values = np.asarray(values, dtype=np.float64)
     if not len(values):
         raise DfsmError("the load history has no samples, so no cycles: give a longer part")
@@ -52,7 +68,7 @@ def damage_equivalent_load(
             f"the load history lasts {duration:g} s, expected more than 0 s: give its length"
         )
     if np.ptp(values) == 0:
-        return 0.0
+        return [0.0] * len(exponents)
     # From its maximum to its maximum nothing remains open after counting (ASTM E1049, 5.4.5);
     # fatpack alone loses the largest cycle of a history that begins or ends at an extreme.
     peak = int(np.argmax(values))
@@ -60,5 +76,6 @@ def damage_equivalent_load(
     ranges = np.asarray(fatpack.find_rainflow_ranges(closed, k=256))
     # Divided by the largest range before the power, or m = 10 overflows in N m.
     largest = ranges.max()
-    damage = np.sum((ranges / largest) ** exponent) / (frequency * duration)
-    return float(largest * damage ** (1 / exponent))
+    cycles = frequency * duration
+    damages = [(m, np.sum((ranges / largest) ** m) / cycles) for m in exponents]
+    return [float(largest * damage ** (1 / m)) for m, damage in damages]

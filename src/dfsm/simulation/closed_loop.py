@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, overload
 
 import equinox as eqx
@@ -28,13 +28,16 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.drawn_run import DrawnRun
-from dfsm.simulation.loop import HostLoop, Path, roll_compiled
-from dfsm.simulation.loop_cases import ClosedLoopSettings, LoopCase, padded, prepared_cases
+from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_compiled
+from dfsm.simulation.loop_cases import (
+    ClosedLoopSettings,
+    LoopCase,
+    enough_calls,
+    padded,
+    prepared_cases,
+)
 from dfsm.simulation.simulate import ESCAPE, MUCH_OUTSIDE
 from dfsm.simulation.wires import Wires, connect, not_commanded
-
-# Calls are padded to a multiple of this, so that runs of similar length share a compilation.
-PAD = 400
 
 
 class LoopStatus(enum.Enum):
@@ -64,7 +67,8 @@ class ClosedLoopRun(DrawnRun):
     reason
         For a loop that did not complete, the signal and where; else "".
     outside
-        Share of the samples with any input of the model outside its training range.
+        Share of the samples with any input of the model outside its training range; not a number
+        where nobody asked.
     wall_time
         Seconds it took (of the whole batch divided by its runs), without compilation when warm.
     """
@@ -188,6 +192,7 @@ def closed_loops(
     window: tuple[float | None, float | None] = (None, None),
     measurements: Mapping[str, str] | None = None,
     settings: ClosedLoopSettings | None = None,
+    watched: bool = True,
 ) -> list[list[ClosedLoopRun]]:
     """Close the loop with each of several controllers over each of several runs.
 
@@ -201,6 +206,8 @@ def closed_loops(
         Any number.
     window
         Start and stop of what is scored in s.
+    watched
+        Whether to tell how long loops are outside the training range.
 
     Returns
     -------
@@ -216,16 +223,28 @@ def closed_loops(
     wires = [connect(model, controller, measurements) for controller in controllers]
     intervals = {float(c.interval) for c in controllers}
     cases = {i: prepared_cases(model, runs, i, window, settings) for i in intervals}
-    begin = clock.perf_counter()
-    tasks = list[tuple[int, int, Callable[[], Path]]]()
-    for i, controller in enumerate(controllers):
-        rolled = _roller(model, wires[i], controller)
-        for run, case in enumerate(cases[float(controller.interval)]):
-            tasks.append((i, run, partial(rolled, case)))
+    ready, begin = model.prepared(), clock.perf_counter()
+    rollers = [
+        (i, float(c.interval), _roller(ready, wires[i], c, watched))
+        for i, c in enumerate(controllers)
+    ]
+    cores = os.cpu_count() or 1
+
+    @lru_cache(maxsize=2 * cores)
+    def drive(interval: float, run: int) -> Drive:
+        case = cases[interval][run]
+        return padded(case, enough_calls(case))
+
+    # All controllers of a run after one another, so that its drive is made once and not kept.
+    tasks = [
+        (i, run, partial(rolled, cases[interval][run], partial(drive, interval, run)))
+        for run in range(len(runs))
+        for i, interval, rolled in rollers
+    ]
     results: dict[tuple[int, int], ClosedLoopRun] = {}
     # XLA keeps a loop on one core, and one that holds several controllers side by side costs more
     # than these in turn; libraries wait in processes of their own.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores) as pool:
         paths = pool.map(lambda task: task[2](), tasks)
         for (i, run, _), path in zip(tasks, paths, strict=True):
             case = cases[float(controllers[i].interval)][run]
@@ -237,21 +256,24 @@ def closed_loops(
     ]
 
 
-def _roller(model: DFSM, wires: Wires, controller: Controller) -> Callable[[LoopCase], Path]:
-    """What closes the loop over one case."""
+def _roller(
+    model: DFSM, wires: Wires, controller: Controller, watched: bool
+) -> Callable[[LoopCase, Callable[[], Drive]], Path]:
+    """What closes the loop over one case, or over its drive that is padded for all controllers."""
     if not is_compiled(controller):
         host, low, high = HostLoop(model, wires), *_bounds(model)
 
         def gone(x: Array) -> bool:
             return not bool(((x >= low) & (x <= high)).all())
 
-        return lambda case: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
+        return lambda case, _: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
     # Numbers as arrays: others would be compiled in, and each controller compiled anew.
     numbers = jax.tree.map(jnp.asarray, controller)
 
-    def compiled(case: LoopCase) -> Path:
-        calls = -(-(len(case.drive.time) + 1) // PAD) * PAD
-        return roll_compiled(model, wires, numbers, padded(case, calls))
+    def compiled(_: LoopCase, padded_drive: Callable[[], Drive]) -> Path:
+        drive = padded_drive()
+        path = roll_compiled(model, wires, numbers, drive)
+        return path._replace(outside=outside_along(model, drive, path)) if watched else path
 
     return compiled
 
@@ -303,7 +325,9 @@ def result_of(
         for c in getattr(s, group)
     )
     values = case.sampled(np.concatenate([states, controls, outputs], axis=1))
-    outside = case.sampled(np.asarray(path.outside)[:steps, None].astype(float))[:, 0]
+    outside = np.full(len(values), np.nan)
+    if path.outside is not None:
+        outside = case.sampled(np.asarray(path.outside)[:steps, None].astype(float))[:, 0]
     return _cut(case, (values, outside), channels, (status, reason, time[min(end, steps - 1)]))
 
 

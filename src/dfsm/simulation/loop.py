@@ -58,7 +58,8 @@ class Path(NamedTuple):
     states, controls, outputs
         Shapes ``(step + 1, n)``, in the model's units; controls as they are from then on.
     outside
-        Whether any input of the model is outside its training range, ``(step + 1,)``.
+        Whether any input of the model is outside its training range, ``(step + 1,)``; None where
+        it was not checked, see `outside_along`.
     measurements
         What the controller read at its calls, in its units, ``(call, measurement)``.
     """
@@ -66,7 +67,7 @@ class Path(NamedTuple):
     states: jax.Array
     controls: jax.Array
     outputs: jax.Array
-    outside: jax.Array
+    outside: jax.Array | None
     measurements: jax.Array
 
 
@@ -193,8 +194,19 @@ def _checked(commands: Any, wires: Wires) -> jax.Array:
 
 @eqx.filter_jit
 def roll_compiled(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
-    """`roll`, compiled; models, controllers and runs of the same shapes share one compilation."""
-    return roll(model.prepared(), wires, controller, drive)
+    """`roll`, compiled; models, controllers and runs of the same shapes share one compilation.
+
+    Fastest with a model that was `prepared` outside of compiled code. The training range is not
+    checked: that takes longer than the controller, and where figures are asked for nobody looks.
+    """
+    return roll(model.prepared(), wires, controller, drive)._replace(outside=None)
+
+
+@eqx.filter_jit
+def outside_along(model: DFSM, drive: Drive, path: Path) -> jax.Array:
+    """Whether any input of a model is outside its training range along a path, ``(step + 1,)``."""
+    _, w, p = model.signals.order.split_exogenous(drive.inputs[::2])
+    return model.region.outside(model.join(path.states, path.controls, w, p))
 
 
 # -- on the host --------------------------------------------------------------------------------

@@ -23,6 +23,8 @@ from dfsm.simulation.simulate import initial_azimuth, initial_state
 
 # Ratios of intervals with denominators up to this are met exactly.
 _MOST_PARTS = 20
+# Calls are padded to a multiple of this.
+_PAD = 400
 
 
 @settings_class
@@ -62,12 +64,15 @@ class LoopCase:
         Plant steps per call.
     scored
         First sample after the start-up.
+    record
+        The whole run as the model takes it.
     """
 
     run: Trajectory
     drive: Drive
     per_call: int
     scored: int
+    record: Trajectory
 
     @property
     def rows(self) -> int:
@@ -138,7 +143,7 @@ def _case(
     mesh = begins + h / 2 * np.arange(2 * calls * per_call + 1)
     fields = part.select(s.names("field")).require_finite()
     drive = Drive(
-        x0=initial_state(model, run, begins),  # pyright: ignore[reportArgumentType]
+        x0=initial_state(model, run, begins, complete=False),  # pyright: ignore[reportArgumentType]
         psi0=initial_azimuth(model, run, begins),  # pyright: ignore[reportArgumentType]
         time=begins + interval * np.arange(calls),  # pyright: ignore[reportArgumentType]
         h=np.full(calls, h),  # pyright: ignore[reportArgumentType]
@@ -147,7 +152,7 @@ def _case(
     )
     inside = part.time <= mesh[-1] + 1e-6 * h
     part = replace(part, time=part.time[inside], values=part.values[inside])
-    return LoopCase(part, drive, per_call, int(after[0]))
+    return LoopCase(part, drive, per_call, int(after[0]), run)
 
 
 def _steps_per_call(interval: float, sampling: float, step: float | None) -> int:
@@ -173,6 +178,12 @@ def _interpolated(run: Trajectory, mesh: Array, kinds: Sequence[Between]) -> Arr
         else:
             inputs[:, i] = np.interp(mesh, run.time, values)
     return inputs
+
+
+def enough_calls(*cases: LoopCase) -> int:
+    """Calls to which all cases are padded, such that runs of similar length share a compilation."""
+    longest = max(len(case.drive.time) for case in cases) + 1
+    return -(-longest // _PAD) * _PAD
 
 
 def padded(case: LoopCase, calls: int) -> Drive:

@@ -69,7 +69,7 @@ def roll_with_slopes(
     count = len(model.signals.observed)
 
     def shown(last: Any, out: Any) -> tuple[jax.Array, Path]:
-        path = march.path(last, out)
+        path = march.path(last, out)._replace(outside=None)
         return jnp.concatenate([path.states[:, :count], path.controls, path.outputs], axis=1), path
 
     _, along, path = jax.linearize(shown, last[0], out, has_aux=True)

@@ -313,7 +313,7 @@ def _stepping(driven: Trajectory, rate: float, settings: SimulationSettings) -> 
     return _Stepping("rk4", step / parts, f"integrated in steps of {step / parts:.3g} s: {why}")
 
 
-def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
+def initial_state(model: DFSM, run: Trajectory, start: float, *, complete: bool = True) -> Array:
     """Recorded state at `start`; rates come from samples up to it, never from the response after.
 
     Parameters
@@ -324,17 +324,18 @@ def initial_state(model: DFSM, run: Trajectory, start: float) -> Array:
         Holds the measured states, and for latent states controls and disturbances.
     start
         Time in s. Where the record begins there, the first second of it gives the rates.
+    complete
+        Whether the run is still to be `completed`.
 
     Returns
     -------
     ndarray
         Shape ``(state,)``.
     """
-    run = completed(run, model.signals)
+    run = completed(run, model.signals) if complete else run
     if model.signals.startup:
         return told_state(model, run, start)
-    latent = latents_from_past(model, run, start)
-    return np.concatenate([_observed_state(model, run, start), latent])
+    return np.append(_observed_state(model, run, start), latents_from_past(model, run, start))
 
 
 def _starts(model: DFSM, initial: ArrayLike, runs: int) -> Array:

@@ -22,7 +22,7 @@ from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.recorded import Recorded, recorded_states
 from dfsm.models.signals import Azimuth, radians_per_second
-from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_equivalent_load
+from dfsm.numerics.fatigue import damage_by_exponent
 from dfsm.numerics.spectra import Band, spectrum
 from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 from dfsm.simulation.hidden import latents_along
@@ -273,11 +273,6 @@ def _statistics(
 ) -> ChannelStatistics:
     values = run[name]
     psd = spectrum(run.time, values)
-    damage = {}
-    if is_load:
-        damage = {
-            f"{m:g}": damage_equivalent_load(values, run.duration, m) for m in WOHLER_EXPONENTS
-        }
     return ChannelStatistics(
         minimum=float(values.min()),
         mean=float(values.mean()),
@@ -285,7 +280,7 @@ def _statistics(
         std=float(values.std()),
         peaks={b.name: psd.peak(b) for b in bands if b is not LOW},
         power={b.name: psd.power(b) for b in bands},
-        damage=damage,
+        damage=damage_by_exponent(values, run.duration) if is_load else {},
         spectrum=psd,
     )
 

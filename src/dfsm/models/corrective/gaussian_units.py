@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from dfsm.models.corrective.form import Corrective
 
@@ -36,10 +37,18 @@ class GaussianUnits(Corrective):
         return self.prepared()(inputs)
 
     def prepared(self) -> ProductForm:
-        """The same function with the square of the distance multiplied out."""
+        """The same function with the square of the distance multiplied out.
+
+        Without the inputs that have no effect, where their scale is known: JAX may be tracing it.
+        """
         norms = jnp.sum(self.centres**2, axis=0)
-        matrix = jnp.concatenate([2 * self.centres, -norms[None], -jnp.ones_like(norms)[None]])
-        return ProductForm(self.shift, self.scale, matrix, self.weights, self.bias)
+        spans, kept = _effective(self.scale)
+        matrix = jnp.concatenate(
+            [2 * self.centres[kept], -norms[None], -jnp.ones_like(norms)[None]]
+        )
+        return ProductForm(
+            self.shift[kept], self.scale[kept], matrix, self.weights, self.bias, spans
+        )
 
     def select(self, rows: Sequence[int]) -> GaussianUnits:
         """Keep some of the targets."""
@@ -77,9 +86,11 @@ class ProductForm(eqx.Module):
     Attributes
     ----------
     shift, scale, weights, bias
-        As for `GaussianUnits`.
+        As for `GaussianUnits`, of the inputs that have an effect.
     matrix
         The right factor, shape ``(input + 2, unit)``.
+    spans
+        First of some inputs that have an effect and one past the last, span by span.
     """
 
     shift: jax.Array
@@ -87,6 +98,7 @@ class ProductForm(eqx.Module):
     matrix: jax.Array
     weights: jax.Array
     bias: jax.Array
+    spans: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     def prepared(self) -> ProductForm:
         """Itself."""
@@ -94,6 +106,20 @@ class ProductForm(eqx.Module):
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
-        z = (inputs - self.shift) / self.scale
+        # Slices put together; general indexing costs several times as much in a rollout.
+        kept = jnp.concatenate([inputs[first:end] for first, end in self.spans])
+        z = (kept - self.shift) / self.scale
         exponents = jnp.concatenate([z, jnp.ones(1), jnp.sum(z**2)[None]]) @ self.matrix
         return self.weights @ jnp.exp(exponents) + self.bias
+
+
+def _effective(scale: jax.Array) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
+    """Spans of the inputs that have an effect, and their columns; all where nobody can know."""
+    count = scale.shape[0]
+    if isinstance(scale, Tracer):
+        return ((0, count),), np.arange(count)
+    kept = np.flatnonzero(np.isfinite(np.asarray(scale)))
+    if not len(kept):
+        return ((0, 0),), kept
+    parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+    return tuple((int(part[0]), int(part[-1]) + 1) for part in parts), kept
