@@ -51,15 +51,24 @@ def measured(asked: TuningTask) -> dict[str, float]:
     rng = np.random.default_rng(0)
     low, high = asked.problem.bounds
     near = start + 0.02 * (high - low) * rng.uniform(-1, 1, (SETS, len(low)))
+    begin = time.process_time()
     one = replace_runs(asked, 1).evaluator
+    prepared = time.process_time() - begin
     one.remember = False
+    run = one.runs[0]
+    with hushed():
+        rollout = seconds(lambda: dfsm.simulate(asked.model, run))
+    alone = seconds(lambda: one(start))
     value = seconds(lambda: evaluator(start))
     gradient = seconds(lambda: evaluator(start, slopes=True), repeats=2)
     begin = time.perf_counter()
     for theta in near:
         evaluator(theta)
     return {
-        "one_run_s": seconds(lambda: one(start)),
+        "prepare_one_run_s": prepared,
+        "one_run_s": alone,
+        "one_rollout_s": rollout,
+        "loop_over_rollout": alone / rollout,
         f"value_of_{RUNS}_runs_s": value,
         f"gradient_of_{RUNS}_runs_s": gradient,
         "gradient_over_value": gradient / value,

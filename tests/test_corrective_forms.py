@@ -194,3 +194,14 @@ def test_a_new_kind_needs_no_change_elsewhere(monkeypatch, tmp_path):
     moved = parameters.at(jnp.asarray(theta))
     change = np.asarray(moved.e.matrix - wide.e.matrix)
     np.testing.assert_allclose(change, [[0, 0, 0, 0, 0, 0.1]], atol=1e-15)
+
+
+@pytest.mark.parametrize("ignored", [(1,), (), (0, 1, 2)])
+def test_inputs_without_effect_are_left_out_and_change_no_digit(ignored):
+    units = forms()["gaussian_units"].ignoring(ignored)
+    ready = units.prepared()
+    assert ready.scale.shape == (3 - len(ignored),)
+    # JAX knows no number of what it traces, so that there all inputs stay in.
+    at = jax.jit(lambda function, z: function(z))
+    for z in POINTS[:3]:
+        np.testing.assert_array_equal(at(ready, z), at(units, z))

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from dfsm.controllers.discon import Discon
 from dfsm.controllers.rosco import ROSCO
@@ -189,6 +188,9 @@ class TuningTask:
         low, high = self.problem.bounds
         points = [np.clip(self.tuned.start, low, high)]
         if self.settings.starts > 1:
+            # Takes a second to load, which one start does not need.
+            from scipy.stats import qmc
+
             drawn = qmc.LatinHypercube(len(low), rng=self.settings.seed)
             shares = drawn.random(self.settings.starts - 1)
             points += list(low + (high - low) * shares)
