@@ -118,7 +118,7 @@ class Evaluator:
         interval = float(tuned.controller.interval)
         self.cases = prepared_cases(model, runs, interval, window, settings)
         self.runs = [case.record for case in self.cases]
-        self._ready = model.prepared()
+        self._ready = model.stripped()
         calls = enough_calls(*self.cases)
         self._drives = [padded(case, calls) for case in self.cases]
         self._controller = jax.tree.map(jnp.asarray, tuned.controller)

@@ -221,6 +221,15 @@ class DFSM(eqx.Module):
         e_g = None if self.e_g is None else self.e_g.prepared()
         return replace(self, e=e, e_g=e_g)  # pyright: ignore[reportArgumentType]
 
+    def stripped(self) -> DFSM:
+        """As `prepared`, without what has no effect: the last digits may be others.
+
+        Not within compiled code, where nobody knows what that is.
+        """
+        e = None if self.e is None else self.e.stripped()
+        e_g = None if self.e_g is None else self.e_g.stripped()
+        return replace(self, e=e, e_g=e_g)  # pyright: ignore[reportArgumentType]
+
     # -- derived models -------------------------------------------------------------------------
 
     def linear_fit(self) -> DFSM:

@@ -223,7 +223,7 @@ def closed_loops(
     wires = [connect(model, controller, measurements) for controller in controllers]
     intervals = {float(c.interval) for c in controllers}
     cases = {i: prepared_cases(model, runs, i, window, settings) for i in intervals}
-    ready, begin = model.prepared(), clock.perf_counter()
+    ready, begin = model.stripped(), clock.perf_counter()
     rollers = [
         (i, float(c.interval), _roller(ready, wires[i], c, watched))
         for i, c in enumerate(controllers)

@@ -26,6 +26,10 @@ class Evaluated(Protocol):
         """Itself."""
         ...
 
+    def stripped(self) -> Evaluated:
+        """Itself."""
+        ...
+
 
 class Corrective(eqx.Module):
     """A function of ``z = (I - shift) / scale`` that adds to some rows of a linear fit.
@@ -51,6 +55,13 @@ class Corrective(eqx.Module):
     def prepared(self) -> Evaluated:
         """The same function in the form that is fastest to evaluate again and again."""
         return self
+
+    def stripped(self) -> Evaluated:
+        """The prepared function without what has no effect; the last digit may be another.
+
+        Its numbers must be known, not traced by JAX.
+        """
+        return self.prepared()
 
     # -- other functions made of it -------------------------------------------------------------
 

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from dfsm.models.corrective.form import Corrective
 
@@ -37,18 +36,20 @@ class GaussianUnits(Corrective):
         return self.prepared()(inputs)
 
     def prepared(self) -> ProductForm:
-        """The same function with the square of the distance multiplied out.
-
-        Without the inputs that have no effect, where their scale is known: JAX may be tracing it.
-        """
+        """The same function with the square of the distance multiplied out."""
         norms = jnp.sum(self.centres**2, axis=0)
-        spans, kept = _effective(self.scale)
-        matrix = jnp.concatenate(
-            [2 * self.centres[kept], -norms[None], -jnp.ones_like(norms)[None]]
+        matrix = jnp.concatenate([2 * self.centres, -norms[None], -jnp.ones_like(norms)[None]])
+        return ProductForm(self.shift, self.scale, matrix, self.weights, self.bias)
+
+    def stripped(self) -> ProductForm:
+        """The prepared function without the inputs that have no effect."""
+        kept = np.flatnonzero(np.isfinite(np.asarray(self.scale)))
+        parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+        spans = tuple((int(part[0]), int(part[-1]) + 1) for part in parts if len(part))
+        few = replace(
+            self, shift=self.shift[kept], scale=self.scale[kept], centres=self.centres[kept]
         )
-        return ProductForm(
-            self.shift[kept], self.scale[kept], matrix, self.weights, self.bias, spans
-        )
+        return replace(few.prepared(), spans=spans or ((0, 0),))
 
     def select(self, rows: Sequence[int]) -> GaussianUnits:
         """Keep some of the targets."""
@@ -90,7 +91,7 @@ class ProductForm(eqx.Module):
     matrix
         The right factor, shape ``(input + 2, unit)``.
     spans
-        First of some inputs that have an effect and one past the last, span by span.
+        First of some inputs that have an effect and one past the last, span by span; None for all.
     """
 
     shift: jax.Array
@@ -98,28 +99,21 @@ class ProductForm(eqx.Module):
     matrix: jax.Array
     weights: jax.Array
     bias: jax.Array
-    spans: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    spans: tuple[tuple[int, int], ...] | None = eqx.field(static=True, default=None)
 
     def prepared(self) -> ProductForm:
         """Itself."""
         return self
 
+    def stripped(self) -> ProductForm:
+        """Itself."""
+        return self
+
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
-        # Slices put together; general indexing costs several times as much in a rollout.
-        kept = jnp.concatenate([inputs[first:end] for first, end in self.spans])
-        z = (kept - self.shift) / self.scale
+        if self.spans is not None:
+            # Slices put together; general indexing costs several times as much in a rollout.
+            inputs = jnp.concatenate([inputs[first:end] for first, end in self.spans])
+        z = (inputs - self.shift) / self.scale
         exponents = jnp.concatenate([z, jnp.ones(1), jnp.sum(z**2)[None]]) @ self.matrix
         return self.weights @ jnp.exp(exponents) + self.bias
-
-
-def _effective(scale: jax.Array) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Spans of the inputs that have an effect, and their columns; all where nobody can know."""
-    count = scale.shape[0]
-    if isinstance(scale, Tracer):
-        return ((0, count),), np.arange(count)
-    kept = np.flatnonzero(np.isfinite(np.asarray(scale)))
-    if not len(kept):
-        return ((0, 0),), kept
-    parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
-    return tuple((int(part[0]), int(part[-1]) + 1) for part in parts), kept
