@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,8 @@ from dfsm.control import (
     solve,
 )
 from dfsm.control.flown import commands_told
+from dfsm.controllers.bladed import BladedLibrary
+from dfsm.controllers.discon import read_discon, write_discon
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning
@@ -401,3 +404,32 @@ def with_units(solution, **units):
         return replace(run, channels=tuple(channels))
 
     return replace(solution, trajectories=tuple(map(changed, solution.trajectories)))
+
+
+@pytest.mark.slow
+def test_the_library_of_the_wheel_flies_the_file(solution, tmp_path):
+    wheel = Path(str(pytest.importorskip("rosco").__path__[0]))
+    (deck,) = wheel.parent.glob("Examples/**/IEA-15-240-RWT-UMaineSemi_DISCON.IN")
+    written = write_rosco(solution, tmp_path / "ol.dat", discon=deck)
+    write_discon(read_discon(deck), tmp_path / "DISCON.IN")
+    lines = (tmp_path / "DISCON.IN").read_text().splitlines()
+    for key, value in written.discon.items():
+        at = [i for i, line in enumerate(lines) if line.partition("!")[2].split()[:1] == [key]]
+        lines[at[-1]] = f"{value} ! {key}"
+    (tmp_path / "DISCON.IN").write_text("\n".join(lines) + "\n")
+    interval, channels = 0.05, {"pitch": ("BldPitch1", "deg")}
+    library = BladedLibrary(
+        next(wheel.glob("lib/libdiscon.*")), tmp_path / "DISCON.IN",
+        interval=interval, channels=channels,
+    )  # fmt: skip
+    seen, flown = np.array([7.0, 11.0, 0.0]), []
+    time = np.arange(98.0, 130.0, interval)
+    state = library.start(seen, np.array([1.5e4, 2.0]))
+    for t in time:
+        state, commands = library.step(state, seen, float(t))
+        flown.append(commands)
+    state.close()
+    optimum, part = solution.trajectory, time > 101.0
+    for column, name, tolerance in ((1, "BldPitch1", 0.01), (0, "GenTq", 1.0)):
+        told = np.interp(time[part], optimum.time, optimum[name])
+        assert np.abs(np.array(flown)[part, column] - told).max() < tolerance, name

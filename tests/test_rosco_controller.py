@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from decks import write_deck
+from dfsm.controllers.bladed import BladedLibrary
 from dfsm.controllers.controller import Controller
 from dfsm.controllers.discon import read_discon
 from dfsm.controllers.rosco import read_rosco
@@ -71,6 +72,48 @@ def test_agrees_with_the_library_of_the_wheel(tmp_path, told, name):
     assert differ(np.asarray(found), expected) < 1e-7
     if name in told.commands:
         assert differ(told.commands[name], expected) < 1e-7
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(WHEEL is None, reason="the rosco wheel is not installed")
+@pytest.mark.parametrize(
+    ("name", "wind"), [("NREL-5MW/DISCON.IN", 12.0), ("MHK_RM1/MHK_RM1_DISCON.IN", 2.0)]
+)
+def test_agrees_with_the_library_on_decks_of_other_turbines(name, wind):
+    """A geared turbine on land, a tidal one that floats and tracks its power."""
+    # At 0.2 s the Kalman filter of the first deck is lost, in the library and here.
+    interval = float(np.float32(0.1))
+    assert WHEEL is not None
+    assert WHEEL.origin is not None
+    wheel = Path(WHEEL.origin).parent
+    deck = wheel.parent / "Examples" / "Test_Cases" / name
+    feedback = read_rosco(deck, interval=interval).inputs.roles[2:]
+    roles = ("generator_speed", "wind", *feedback, "power", "torque", "pitch")
+    told = {role: CHANNELS[role] for role in roles}
+    ours = read_rosco(deck, interval=interval, channels=told, as_library=True)
+    theirs = BladedLibrary(
+        next(wheel.glob("lib/libdiscon.*")), deck, interval=interval, channels=told
+    )
+    time = interval * np.arange(700)
+    rated, torque = (float(ours.parameters[k]) for k in ("PC_RefSpd", "VS_RtTq"))
+    speed = rated * (0.93 + 0.1 * np.sin(0.05 * time) + 0.02 * np.sin(0.5 * time))
+    measured = {
+        "GenSpeed": speed,
+        "Wind1VelX": wind * (1 + 0.2 * np.sin(0.05 * time - 0.4)),
+        "YawBrTAxp": 0.05 * np.sin(0.3 * time),
+        "GenPwr": 0.76 * torque * speed,
+    }
+    # The library takes single precision.
+    rows = np.float32(np.column_stack([measured[n] for n in ours.measurements])).astype(float)
+    begun = np.float32([0.8 * torque, 0.02]).astype(float)
+    found = answers(ours, jnp.asarray(begun), jnp.asarray(rows))
+    state, expected = theirs.start(rows[0], begun), []
+    for at, row in zip(time[1:], rows[1:], strict=True):
+        state, commands = theirs.step(state, row, float(at))
+        expected.append(commands)
+    state.close()
+    assert np.ptp(np.array(expected), axis=0).min() > 0.1
+    assert differ(np.asarray(found), np.array(expected)) < 1e-6
 
 
 @pytest.fixture(scope="module")

@@ -40,6 +40,8 @@ _SET = (1, 2, 4, 33, 34, 14, 15, 20, 21, 23, 27, 53, 83)
 # Collective pitch, torque, and whether the generator is on the grid.
 _GET = (45, 47, 35)
 _FIRST, _LATER, _LAST = 0, 1, -1
+# Modes of ROSCO that pitch each blade.
+_BY_BLADE = ("IPC_ControlMode", "OL_Mode", "AWC_Mode", "PF_Mode")
 # Seconds that a library has for one call, and for its last.
 _PATIENCE = 120.0
 _FAREWELL = 5.0
@@ -59,7 +61,10 @@ class _Process:
             "input": library._brought(self.folder),
             "name": "dfsm",
             "size": 4000,
-            "records": {3: library.interval, 35: 1.0, 61: library.blades, 129: 4000},
+            "records": {
+                **{3: library.interval, 28: library._blade_by_blade},
+                **{35: 1.0, 61: library.blades, 129: 4000},
+            },
             "set": _SET,
             "get": _GET,
         }
@@ -351,6 +356,15 @@ class BladedLibrary:
             gearbox if self.gearbox is None else self.gearbox,
             efficiency if self.efficiency is None else self.efficiency,
         )
+
+    @property
+    def _blade_by_blade(self) -> float:
+        """1 where ROSCO asks for ServoDyn's Ptch_Cntrl 1; it then tells the collective pitch, too.
+
+        Moments of the blades are not measured, so that their own pitch control adds nothing.
+        """
+        discon = self.discon if isinstance(self.discon, Discon) else None
+        return float(discon is not None and any(discon.integer(k, 0) > 0 for k in _BY_BLADE))
 
     @property
     def _told(self) -> str:
