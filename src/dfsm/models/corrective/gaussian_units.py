@@ -46,10 +46,16 @@ class GaussianUnits(Corrective):
         kept = np.flatnonzero(np.isfinite(np.asarray(self.scale)))
         parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
         spans = tuple((int(part[0]), int(part[-1]) + 1) for part in parts if len(part))
-        few = replace(
-            self, shift=self.shift[kept], scale=self.scale[kept], centres=self.centres[kept]
+        ready, count = self.prepared(), self.centres.shape[0]
+        # Units keep their distance from the middle of the others' ranges.
+        rows = np.array([*kept, count, count + 1])
+        return replace(
+            ready,
+            shift=ready.shift[kept],
+            scale=ready.scale[kept],
+            matrix=ready.matrix[rows],
+            spans=spans or ((0, 0),),
         )
-        return replace(few.prepared(), spans=spans or ((0, 0),))
 
     def select(self, rows: Sequence[int]) -> GaussianUnits:
         """Keep some of the targets."""
