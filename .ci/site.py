@@ -38,6 +38,9 @@ _TITLES = {
     "errors": "Errors",
 }
 
+# What begins the page of its package; others follow in the order of the table of names.
+_FIRST = ("DFSM", "fit", "FitSettings", "FitResult", "ODESystem", "simulate", "validate", "solve")
+
 
 def links(markdown: str) -> list[tuple[str, str]]:
     """Targets inside the repository, and their anchors, outside fenced code."""
@@ -142,7 +145,8 @@ def reference_pages(homes: Mapping[str, str]) -> dict[str, str]:
     pages = {}
     for package in sorted(packages, key=order.index):
         title = _TITLES.get(package, package.capitalize())
-        names = "\n\n".join(f"::: dfsm.{name}" for name in packages[package])
+        ordered = sorted(packages[package], key=lambda name: name not in _FIRST)
+        names = "\n\n".join(f"::: dfsm.{name}" for name in ordered)
         pages[f"{REFERENCE}/{package}.md"] = f"# {title}\n\n{names}\n"
     return pages
 

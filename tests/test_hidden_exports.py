@@ -97,6 +97,8 @@ def test_exports_tell_the_step_and_where_hidden_states_start(tmp_path: Path):
     assert "Nobody measures hidden1, hidden2" in header
     made = write_fmu(model, tmp_path / "m.fmu")
     assert next(v.start for v in made.variables if v.name == "rk4_step") == pytest.approx(0.1)
+    (note,) = made.notes
+    assert note.startswith("hidden1, hidden2, which nobody measures, start at their mean over the")
     stiff = linear_model(np.array([[-30.0]]), np.array([[1.0]]))
     assert description(stiff)["step"] == pytest.approx(1.5 / 30)
 

@@ -54,12 +54,12 @@ def casadi(model: Model, output: File, quiet: Quiet = False) -> None:
     check_file(output)
     functions = to_casadi(load(model))
     functions.save(output)
-    _tell(output, functions.description["computed_inputs"], quiet)
+    _tell(output, functions.description["notes"], quiet)
 
 
-def _tell(output: Path | str, computed: Sequence[str], quiet: bool) -> None:
+def _tell(output: Path | str, notes: Sequence[str], quiet: bool) -> None:
     say(lines(f"wrote {output}"), quiet)
-    for sentence in computed:
+    for sentence in notes:
         say(lines(f"note: {sentence}"), quiet)
 
 
@@ -70,7 +70,7 @@ def c(model: Model, output: Folder, name: Name = None, quiet: Quiet = False) -> 
     from dfsm.models.model_folder import load
 
     made = write_c(load(model), output, name)
-    _tell(output, made.description["computed_inputs"], quiet)
+    _tell(output, made.description["notes"], quiet)
 
 
 @exports.command()
@@ -79,7 +79,7 @@ def python(model: Model, output: Folder, quiet: Quiet = False) -> None:
     from dfsm.exports.python_model import write_python
     from dfsm.models.model_folder import load
 
-    _tell(output, write_python(load(model), output)["computed_inputs"], quiet)
+    _tell(output, write_python(load(model), output)["notes"], quiet)
 
 
 @exports.command()
@@ -105,4 +105,4 @@ def fmu(
         if made.binary is None
         else f"a binary for {made.binary}"
     )
-    _tell(f"{output} ({what})", made.computed_inputs, quiet)
+    _tell(f"{output} ({what})", made.notes, quiet)

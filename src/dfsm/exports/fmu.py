@@ -49,12 +49,15 @@ class FMU:
         Which system the archive has a binary for; None where no compiler was there.
     computed_inputs
         Which inputs must be computed from others before they are supplied.
+    notes
+        These, and where hidden states start.
     """
 
     path: Path
     variables: tuple[Variable, ...]
     binary: str | None
     computed_inputs: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def write_fmu(
@@ -116,7 +119,8 @@ def write_fmu(
             entry = zipfile.ZipInfo(name, _DATE)
             archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
     where = None if binary is None else binary[0].split("/")[1]
-    return FMU(path, variables, where, tuple(code.description["computed_inputs"]))
+    told = code.description
+    return FMU(path, variables, where, tuple(told["computed_inputs"]), tuple(told["notes"]))
 
 
 def _safe_step(model: DFSM, longest: float | None) -> float:

@@ -89,6 +89,10 @@ def description(model: DFSM) -> dict[str, Any]:
     told["latent_starts"] = _latent_starts(model)
     told["step"] = longest_step(model)
     told["computed_inputs"] = computed_inputs(model)
+    told["notes"] = [*told["computed_inputs"]]
+    if s.startup:
+        names = ", ".join(told["latent_states"])
+        told["notes"].append(f"{names}, which nobody measures, start at {told['latent_starts']}")
     rate = s.azimuth_rate
     if rate is not None:
         told["azimuth"] = {"unit": "rad", "speed": s.states[rate[0]].name, "rad/s": rate[1]}
