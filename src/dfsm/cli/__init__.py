@@ -160,7 +160,7 @@ def fit(
     begin, compiling = time.perf_counter(), compile_clock()
     with locked(output):
         with working(quiet):
-            config_settings, runs = load_config(config)
+            config_settings, runs = load_config(config, whole=False)
             tell_notes(runs, quiet)
             settings = config_settings.fit_settings()
             if chosen is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +26,7 @@ from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import MLP, CorrectiveSettings
 from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.samples import only_read
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
 from dfsm.models.terms import Rotor, TermSettings
@@ -203,8 +205,15 @@ class Config(Strict):
         return term
 
 
-def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
+def load_config(path: str | Path, *, whole: bool = True) -> tuple[Config, list[Trajectory]]:
     """Read a configuration and the training runs that it names.
+
+    Parameters
+    ----------
+    path
+        The configuration.
+    whole
+        Keep all channels of the runs; otherwise those that its fit reads, see `only_read`.
 
     Raises
     ------
@@ -219,7 +228,8 @@ def load_config(path: str | Path) -> tuple[Config, list[Trajectory]]:
         _check_together(config)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
-    runs = read_all(config.data.train, path.parent, config.data.step)
+    keep = None if whole else partial(only_read, settings=config.fit_settings())
+    runs = read_all(config.data.train, path.parent, config.data.step, keep)
     return config, config.with_parameters(runs)
 
 

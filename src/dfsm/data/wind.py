@@ -10,14 +10,16 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
 CORRECTED_WIND = "RtVAvgxhCorr"
+# What it is computed from: the wind that the rotor meets, and the platform's pitching.
+WIND_SOURCES = ("RtVAvgxh", "PtfmRVyt")
 _RELATIVE_WIND = re.compile(r"RtVAvg[xyz]h|A?B\dN\d+VRel", re.IGNORECASE)
 
 
 def undisturbed_rotor_wind(
     trajectory: Trajectory,
     hub_height: float,
-    wind: str = "RtVAvgxh",
-    rate: str = "PtfmRVyt",
+    wind: str = WIND_SOURCES[0],
+    rate: str = WIND_SOURCES[1],
     name: str = CORRECTED_WIND,
 ) -> Trajectory:
     """Add the rotor-averaged wind with the platform's pitching taken out again.

@@ -35,7 +35,7 @@ from dfsm.data.steps import Steps
 from dfsm.data.stuck import stuck_notes
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
-from dfsm.data.wind import wind_warning
+from dfsm.data.wind import CORRECTED_WIND, WIND_SOURCES, wind_warning
 from dfsm.errors import DfsmError
 from dfsm.fitting.held_inputs import held_note, held_unseen
 from dfsm.fitting.settings import FitSettings
@@ -148,6 +148,26 @@ class Samples:
         ends = np.flatnonzero(np.diff(self.runs, append=-1)) + 1
         for start, stop in zip([0, *ends[:-1]], ends, strict=True):
             yield slice(start, stop)
+
+
+def only_read(run: Trajectory, settings: FitSettings) -> Trajectory:
+    """A run without the channels that a fit never reads, so that many fit into memory.
+
+    The run itself where a channel that the fit needs is not there, for what else it has is told
+    then, and where channels of two rates are filled, which ends the run where the first does.
+    """
+    names = dict.fromkeys(settings.roles)
+    names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
+    computed = {f.name for f in settings.features} | set(settings.parameters)
+    if settings.azimuth is not None:
+        angle = settings.azimuth.angle
+        names.update(dict.fromkeys((*settings.azimuth.field, *([] if angle is None else [angle]))))
+    if settings.hub_height is not None:
+        names.update(dict.fromkeys(WIND_SOURCES))
+        computed |= {CORRECTED_WIND, *WIND_SOURCES}
+    if settings.slower is not None or any(n not in run for n in names if n not in computed):
+        return run
+    return run.select(n for n in run.names if n in names)
 
 
 def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
@@ -300,8 +320,9 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         )
     lengths = [len(p[0]) for p in parts]
     weights = weights_over_time([p[5] for p in parts])
+    # One after the other, and each without its parts: many runs fill the memory.
     inputs, derivatives, outputs, harmonics, field, time, psi = (
-        np.concatenate(c) for c in zip(*parts, strict=True)
+        np.concatenate([part.pop(0) for part in parts]) for _ in range(7)
     )
     require_moving(settings.states, inputs[:, signals.observed_columns])
     return Samples(

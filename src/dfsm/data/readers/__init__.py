@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,7 +96,10 @@ def read(path: str | Path, step: float | None = None) -> Trajectory:
 
 
 def read_all(
-    patterns: Iterable[str | Path], base: Path | None = None, step: float | None = None
+    patterns: Iterable[str | Path],
+    base: Path | None = None,
+    step: float | None = None,
+    keep: Callable[[Trajectory], Trajectory] | None = None,
 ) -> list[Trajectory]:
     """Read every file that the patterns name, each once, in the order named.
 
@@ -108,6 +111,8 @@ def read_all(
         Folder that relative patterns start from; default the working folder.
     step
         Interval between samples in s for tables that hold no time.
+    keep
+        What is kept of a run before the next one is read; default all of it.
 
     Returns
     -------
@@ -119,7 +124,8 @@ def read_all(
     DfsmError
         A pattern matches nothing, a file is missing, or one cannot be read.
     """
-    return [read(path, step) for path in track(_paths(patterns, base), "Reading runs")]
+    paths = track(_paths(patterns, base), "Reading runs")
+    return [read(path, step) if keep is None else keep(read(path, step)) for path in paths]
 
 
 def describe_all(
