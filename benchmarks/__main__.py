@@ -2,7 +2,7 @@
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
     [unseen] [limits] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid] [peer]
-    [dymos] [gpu] [fuzz] [kill] [feedback]
+    [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
 
 Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER`` for published
 records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
@@ -38,6 +38,7 @@ from benchmarks import (
     limits,
     loops,
     matched,
+    memory,
     parameters,
     peer,
     rollouts,
@@ -57,6 +58,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "accuracy": accuracy.run,
     "speed": speed.run,
     "startup": startup.run,
+    "memory": memory.run,
     "parameters": parameters.run,
     "scaling": scaling.run,
     "rollouts": rollouts.run,
@@ -76,7 +78,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "kill": kill.run,
 }
 # Run where they are named alone.
-NAMED = ("sysid", "peer", "dymos", "fuzz", "kill")
+NAMED = ("sysid", "memory", "peer", "dymos", "fuzz", "kill")
 
 
 def main() -> None:
@@ -107,6 +109,8 @@ def main() -> None:
         figures[name] = PARTS[name](*told.get(name, ()))
         if name == "startup":
             print("\n".join(startup.startup_table(figures[name])), file=sys.stderr)
+        if name == "memory":
+            print("\n".join(memory.memory_table(figures[name])), file=sys.stderr)
     print(json.dumps(json_value(figures), indent=2))
 
 

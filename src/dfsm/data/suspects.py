@@ -85,7 +85,7 @@ def screened(
         units = [run.channel(name).unit for run in kept]
         if not all(agree(units[0], unit) for unit in units):
             continue  # which is said of the runs' units, and needs no guess
-        odd = _other_unit([run.window(*window) for run in kept], name)
+        odd = _other_unit(run.window(*window)[name] for run in kept)
         if odd is None:
             continue
         place, factor, word = odd
@@ -168,18 +168,17 @@ def _rows(samples: Array, which: Callable[[Array], NDArray[np.bool_]]) -> IntArr
     return np.concatenate([np.empty(0, dtype=np.int64), *parts])
 
 
-def _other_unit(runs: Sequence[Trajectory], name: str) -> tuple[int, float, str] | None:
+def _other_unit(channels: Iterable[Array]) -> tuple[int, float, str] | None:
     """The run that is off by the factor of a unit from all others, which agree."""
-    if len(runs) < 2:
-        return None
     figures = []
-    for run in runs:
-        samples = run[name]
+    for samples in channels:
         if not np.isfinite(samples).all():
             return None
         figures.append((samples.std(), np.ptp(samples), abs(samples.mean())))
     table = np.array(figures)
-    for place in range(len(runs)):
+    if len(table) < 2:
+        return None
+    for place in range(len(table)):
         others = np.delete(table, place, axis=0)
         usual = np.median(others, axis=0)
         # A mean of nearly nothing says nothing.

@@ -182,6 +182,8 @@ class Trajectory(Drawn):
         """Keep the named channels, in this order."""
         columns = self.columns(names)
         channels = tuple(self.channels[i] for i in columns)
+        if columns == list(range(len(self.channels))):
+            return self._part(channels=channels)  # all of them: they need no second place
         # The constructor tells a name that is twice among them.
         make = self._part if len(set(columns)) == len(columns) else partial(replace, self)
         return make(values=self.values[:, columns], channels=channels)
@@ -210,6 +212,8 @@ class Trajectory(Drawn):
                 f"the time window asked for ({start if start is not None else '…'} to "
                 f"{stop if stop is not None else '…'} s): change the window or leave the run out"
             )
+        if keep.all():
+            return self._part()
         time, wall = self.time[keep], self.wall_time
         if wall is not None:
             wall = wall * (float(time[-1] - time[0]) / self.duration)

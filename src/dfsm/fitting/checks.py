@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.data.dataset import Dataset
 from dfsm.errors import DfsmError, hushed
@@ -21,6 +23,8 @@ from dfsm.simulation.simulate import Status, simulate
 # Training runs that are simulated to check a new model, and those of them along which pairs of
 # rollouts from different initial states are followed.
 _CHECK_RUNS, _PAIRED_RUNS = 8, 3
+# Samples at which a model is evaluated together.
+_TOGETHER = 2**18
 
 
 def check(
@@ -33,9 +37,7 @@ def check(
     """
     held = held_records(data, settings, samples)
     notes = data_warnings(data, settings, samples) + list(held.values())
-    x, u, w, p = model.split(samples.inputs)
-    values = np.concatenate([model.derivative(x, u, w, p), model.output(x, u, w, p)], axis=1)
-    if not np.isfinite(values).all():
+    if not all(map(np.all, _finite(model, samples))):
         raise DfsmError(
             "the fitted model is not finite on its own training samples: fewer "
             "corrective.samples, or another corrective.kind, may cure it"
@@ -85,6 +87,14 @@ def check(
         "verdicts": verdicts(samples, settings, evidence),
     }
     return notes, checks, judged
+
+
+def _finite(model: DFSM, samples: Samples) -> Iterator[NDArray[np.bool_]]:
+    """Which derivatives and outputs are finite, part by part to bound memory."""
+    for start in range(0, len(samples.inputs), _TOGETHER):
+        x, u, w, p = model.split(samples.inputs[start : start + _TOGETHER])
+        yield np.isfinite(model.derivative(x, u, w, p))
+        yield np.isfinite(model.output(x, u, w, p))
 
 
 def _unexpected(model: DFSM) -> str:

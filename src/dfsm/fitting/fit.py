@@ -30,7 +30,7 @@ from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
-from dfsm.fitting.gate import correct, predicted
+from dfsm.fitting.gate import correct, predict, predicted
 from dfsm.fitting.hidden.advice import hidden_advice
 from dfsm.fitting.hidden.build import fit_hidden, require_hidden
 from dfsm.fitting.known import known_coefficients
@@ -122,7 +122,8 @@ def fit(
         rows, samples = over_intervals(samples, lambda rows: _fit_slopes(rows, settings))
         f = _fit_derivatives(rows, settings)
     with _timed(seconds, "doubts"):
-        residuals = rows.derivatives - predicted(f.model, rows.linear_inputs)
+        residuals = predict(f.model, rows, rows.linear_inputs, rows.derivatives)
+        np.subtract(rows.derivatives, residuals, out=residuals)
         doubt = doubts(rows, f, residuals, settings, intervals=rows is not samples)
     with _timed(seconds, "corrective functions"):
         later = hidden is not None or (refinement is not None and refinement.network > 0)

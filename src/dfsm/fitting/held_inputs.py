@@ -29,9 +29,10 @@ def held_unseen(states: Array, inputs: Array, runs: IntArray) -> list[int]:
     runs
         Run of every sample.
     """
-    bends = np.diff(inputs, 2, axis=0)[runs[2:] == runs[:-2]]
-    rough = np.sqrt(np.mean(bends**2, axis=0)) > _ROUGH * inputs.std(axis=0)
-    columns = np.flatnonzero(rough & (inputs.std(axis=0) > 0))
+    within = runs[2:] == runs[:-2]
+    bends = np.array([np.sqrt(np.mean(np.diff(v, 2)[within] ** 2)) for v in inputs.T])
+    spread = np.array([v.std() for v in inputs.T])
+    columns = np.flatnonzero((bends > _ROUGH * spread) & (spread > 0))
     rows = np.flatnonzero(runs[2:] == runs[:-2]) + 1
     count = len(columns)
     width = 2 * states.shape[1] + 2 * inputs.shape[1] + count + 1

@@ -10,6 +10,7 @@ only where the derivative does not follow it as the fit says.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
 
@@ -42,15 +43,12 @@ def noise_shares(inputs: Array, target: Array, runs: IntArray, row: Array) -> Ar
     shares = np.zeros(inputs.shape[1])
     if len(inputs) < _FEWEST:
         return shares
-    x = inputs - inputs.mean(axis=0)
-    own = _partial_variance(x)
+    own = _partial_variance(inputs)
     within = np.diff(runs) == 0
-    third = np.diff(inputs, n=3, axis=0)[within[2:] & within[1:-1] & within[:-2]]
-    noise = (np.median(np.abs(third), axis=0) / _QUARTILE) ** 2 / _BINOMIAL
-    # What is white must also be white over two steps; jumps and slow changes are not.
-    wide = (inputs[2:] - inputs[:-2])[within[1:] & within[:-1]]
-    noise = np.minimum(noise, (np.median(np.abs(wide), axis=0) / _QUARTILE) ** 2 / 2)
+    noise = np.array([_white(column, within) for column in inputs.T])
     share = noise / np.maximum(own, np.finfo(float).tiny)
+    if not ((share > _SHARE) & (share < 1)).any():
+        return shares
     fast = np.diff(np.column_stack([inputs, target]), n=2, axis=0)[within[1:] & within[:-1]]
     fast = fast - fast.mean(axis=0)
     spread = np.maximum(fast.std(axis=0)[:-1], np.finfo(float).tiny)
@@ -61,9 +59,20 @@ def noise_shares(inputs: Array, target: Array, runs: IntArray, row: Array) -> Ar
     return shares
 
 
-def _partial_variance(x: Array) -> Array:
+def _white(values: Array, within: NDArray[np.bool_]) -> float:
+    """Variance of what is white in samples ``(sample,)`` of runs, by their differences."""
+    third = np.diff(values, n=3)[within[2:] & within[1:-1] & within[:-2]]
+    noise = (np.median(np.abs(third)) / _QUARTILE) ** 2 / _BINOMIAL
+    # What is white must also be white over two steps; jumps and slow changes are not.
+    wide = (values[2:] - values[:-2])[within[1:] & within[:-1]]
+    return float(min(noise, (np.median(np.abs(wide)) / _QUARTILE) ** 2 / 2))
+
+
+def _partial_variance(inputs: Array) -> Array:
     """Variance of each input that the others do not explain."""
-    scale = np.maximum(x.std(axis=0), np.finfo(float).tiny)
-    correlations = (x / scale).T @ (x / scale) / len(x)
+    z = inputs - inputs.mean(axis=0)
+    scale = np.maximum(z.std(axis=0), np.finfo(float).tiny)
+    z /= scale
+    correlations = z.T @ z / len(z)
     inverse = np.linalg.pinv(correlations, rcond=1e-12, hermitian=True)
     return scale**2 / np.maximum(np.diag(inverse), 1.0)

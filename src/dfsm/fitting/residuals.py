@@ -76,8 +76,12 @@ def residuals_of(
     memory = float(np.mean([_memory(time[part], left[part]) for part in parts]))
     together = sum(float(time[part][-1] - time[part][0]) for part in parts)
     step = max(step, memory / _PER_CORRELATION, together / _MOST)
-    table = np.column_stack([inputs, target, left])
-    means = [m for part in parts if len(m := _means(time[part], table[part], step))]
+
+    def means_of(part: slice) -> Array:
+        table = np.column_stack([inputs[part], target[part], left[part]])
+        return _means(time[part], table, step)
+
+    means = [m for part in parts if len(m := means_of(part))]
     if sum(len(m) for m in means) < 4 * (inputs.shape[1] + 1):
         return None
     return Residuals(

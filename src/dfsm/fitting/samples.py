@@ -167,7 +167,7 @@ def only_read(run: Trajectory, settings: FitSettings) -> Trajectory:
         computed |= {CORRECTED_WIND, *WIND_SOURCES}
     if settings.slower is not None or any(n not in run for n in names if n not in computed):
         return run
-    return run.select(n for n in run.names if n in names)
+    return run.select(n for n in names if n in run)
 
 
 def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
@@ -200,8 +200,9 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     for name in names:
         data.channel(name)
     for name in (*settings.controls, *settings.driving):
-        windows = [r.window(settings.start, settings.stop)[name] for r in data]
-        low, high = min(w.min() for w in windows), max(w.max() for w in windows)
+        # One after the other: a window holds all channels.
+        ends = [(w.min(), w.max()) for r in data for w in [r.window(*window)[name]]]
+        low, high = min(least for least, _ in ends), max(most for _, most in ends)
         if low == high:
             raise DfsmError(
                 f"{roles[name]} '{name}' is {low:g} throughout all {len(data)} runs, so nothing "
@@ -286,7 +287,7 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         for n, kind in zip(signals.driving, signals.between, strict=True)
     ]
     kinked = "hold" in bends or any(same_instant(run.time).any() for run in data)
-    parts: list[list[Array]] = []
+    tables, times, begin = _places(data, settings), list[Array](), 0
     labels: tuple[tuple[str, str], ...] = ()
     for whole_run in track(data, "derivatives"):
         run = lead_in(whole_run, settings.start, settings.derivatives)
@@ -299,53 +300,62 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
-        azimuth, psi = settings.azimuth, _azimuth(whole, settings.azimuth)[rows]
-        harmonics = np.empty((len(psi), 0))
-        if azimuth is not None and not azimuth.rings:
-            harmonics = np.asarray(blade_harmonics(psi, azimuth.blades))
+        times.append(run.time[rows])
+        place = slice(begin, begin := begin + len(times[-1]))
+        azimuth = settings.azimuth
+        if azimuth is not None:
+            psi = _azimuth(whole, azimuth)[rows]
+            tables["psi"][place] = psi
+            if not azimuth.rings:
+                tables["harmonics"][place] = blade_harmonics(psi, azimuth.blades)
         if kinked:
             values = run.select(signals.exogenous).values
             inputs = polynomials(run.time, values, signals.between_samples())
             steps.append(Steps.of(extracted, rows, inputs, settings.states, len(signals.driving)))
-        parts.append(
-            [
-                inside.select(order.names).values,
-                extracted.derivatives[rows],
-                run.select(settings.outputs).values[rows],
-                harmonics,
-                run.select(azimuth.field if azimuth else ()).values[rows],
-                run.time[rows],
-                psi,
-            ]
-        )
-    lengths = [len(p[0]) for p in parts]
-    weights = weights_over_time([p[5] for p in parts])
-    # One after the other, and each without its parts: many runs fill the memory.
-    inputs, derivatives, outputs, harmonics, field, time, psi = (
-        np.concatenate([part.pop(0) for part in parts]) for _ in range(7)
-    )
+        tables["inputs"][place] = inside.select(order.names).values
+        tables["derivatives"][place] = extracted.derivatives[rows]
+        tables["outputs"][place] = run.select(settings.outputs).values[rows]
+        tables["field"][place] = run.select(azimuth.field if azimuth else ()).values[rows]
+    inputs = tables["inputs"]
     require_moving(settings.states, inputs[:, signals.observed_columns])
     return Samples(
-        inputs=inputs,
-        derivatives=derivatives,
-        outputs=outputs,
-        harmonics=harmonics,
-        field=field,
-        time=time,
-        psi=psi,
-        runs=np.repeat(np.arange(len(data)), lengths),
+        **tables,
+        time=np.concatenate(times),
+        runs=np.repeat(np.arange(len(data)), [len(time) for time in times]),
         signals=signals,
         derivative_names=labels,
         terms=terms_of(settings.terms, signals.inputs, inputs),
-        weights=weights,
+        weights=weights_over_time(times),
         steps=tuple(steps),
         rough=rough,
     )
 
 
+def _places(data: Dataset, settings: FitSettings) -> dict[str, Array]:
+    """Tables for the samples of all runs, zero: many runs would not fit into memory twice."""
+    count, azimuth = 0, settings.azimuth
+    for run in data:
+        used = lead_in(run, settings.start, settings.derivatives)
+        count += len(used.window(known_from(run, settings), settings.stop))
+    driving = len(settings.controls) + len(settings.driving) + len(settings.parameters)
+    states = len(state_names(settings.states))
+    blades = 0 if azimuth is None or azimuth.rings else 2
+    widths = {
+        "inputs": driving + states,
+        "derivatives": states,
+        "outputs": len(settings.outputs),
+        "harmonics": blades,
+        "field": len(azimuth.field) if azimuth else 0,
+    }
+    tables = {name: np.zeros((count, width)) for name, width in widths.items()}
+    return tables | {"psi": np.zeros(count)}
+
+
 def _rough(data: Dataset, signals: SignalTable, settings: FitSettings) -> tuple[str, ...]:
     """Names of the inputs that are joined by lines and turn at nearly every sample."""
-    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
+    driving = [run.select(signals.driving) for run in data]
+    pairs = zip(data, driving, strict=True)
+    runs = [few.window(known_from(run, settings), settings.stop) for run, few in pairs]
     return rough_ones(runs, signals.driving, signals.between)
 
 
@@ -395,7 +405,7 @@ def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
 def _between(data: Dataset, settings: FitSettings) -> tuple[Between, ...]:
     """What inputs do between samples: as chosen, else as it looks in the training data."""
     names = (*settings.controls, *settings.driving)
-    windows = [run.window(settings.start, settings.stop) for run in data]
+    windows = (run.window(settings.start, settings.stop) for run in data)
     return resolved(settings.inputs, names, recognised(windows, names))
 
 

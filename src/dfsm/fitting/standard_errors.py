@@ -47,16 +47,18 @@ def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
     errors = np.full(x.shape[1], np.inf)
     if not varies.any():
         return errors
-    x = x[:, varies] / scale[varies]
-    g = x @ np.linalg.pinv(x.T @ x, rcond=1e-13, hermitian=True)
+    x = x if varies.all() else x[:, varies]
+    x /= scale[varies]
+    inverse = np.linalg.pinv(x.T @ x, rcond=1e-13, hermitian=True)
     ends = np.flatnonzero(np.diff(runs, append=-1)) + 1
-    variance, independent = np.zeros(g.shape[1]), 0.0
+    variance, independent = np.zeros(x.shape[1]), 0.0
     for start, stop in zip([0, *ends[:-1]], ends, strict=True):
         remembers = float(correlation_length(left[start:stop, None])[0])
         independent += (stop - start) / max(remembers, _STENCIL)
         # Sums over much less than the residual remembers do not change how sums vary.
         places = np.arange(0, stop - start, max(1, int(remembers / _PER_MEMORY)))
-        products = np.add.reduceat(g[start:stop] * left[start:stop, None], places, axis=0)
+        g = x[start:stop] @ inverse
+        products = np.add.reduceat(g * left[start:stop, None], places, axis=0)
         variance += correlation_length(products) * np.sum(products**2, axis=0)
     free = independent - x.shape[1] - 1
     if free > 0:
