@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,12 +14,14 @@ from hypothesis import strategies as st
 from conftest import CONFIG, changed, write_config
 from dfsm.config.fit import Config, load_config, parse_config
 from dfsm.data.derivatives import Filter, StateSpec
+from dfsm.data.features import Feature
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.corrective.gaussian_process import GP
 from dfsm.fitting.corrective.perceptron import MLP
 from dfsm.fitting.corrective.rbf import RBF, IncrementalRBF
 from dfsm.fitting.linear import LPV, LTI
+from dfsm.fitting.samples import extract, only_read, select
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Azimuth
 
@@ -110,6 +113,25 @@ def test_files_are_found_from_the_folder_of_the_config(folder, tmp_path, monkeyp
     config, runs = load_config(folder / "config.yaml")
     assert config.linear == LTI()
     assert [Path(r.source or "").name for r in runs] == ["a.csv", "b.parquet", "c.outb"]
+
+
+def test_a_fit_keeps_only_the_channels_that_it_reads(folder):
+    config, whole = load_config(folder / "config.yaml")
+    settings = replace(config.fit_settings(), outputs=("y",))
+    few = [only_read(run, settings) for run in whole]
+    assert all(run.names == ("q", "u", "w", "y") for run in few)
+    assert all("z" in run for run in whole)
+    data = select(few, settings)
+    # No second copy of the records, and the same samples as with all channels.
+    assert all(any(np.shares_memory(r.values, f.values) for f in few) for r in data)
+    ours, theirs = extract(data, settings), extract(select(whole, settings), settings)
+    for name in ("inputs", "derivatives", "outputs", "time", "psi", "runs"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    # Where one is lacking all are kept, for the message that names the near ones.
+    lacking = replace(settings, controls=("uu",))
+    assert only_read(whole[0], lacking) is whole[0]
+    delayed = replace(settings, features=(Feature(source="w", kind="delay", seconds=0.1),))
+    assert only_read(whole[0], delayed).names == ("q", "u", "w", "y")
 
 
 @pytest.mark.parametrize(

@@ -270,9 +270,8 @@ class Trajectory(Drawn):
     def with_roles(self, roles: Mapping[str, Role]) -> Trajectory:
         """Set the roles of the named channels; the others keep theirs."""
         self.columns(roles)
-        return replace(
-            self, channels=tuple(replace(c, role=roles.get(c.name, c.role)) for c in self.channels)
-        )
+        channels = tuple(replace(c, role=roles.get(c.name, c.role)) for c in self.channels)
+        return self._part(channels=channels)
 
     def require_finite(self) -> Trajectory:
         """Return self, or fail on the first NaN or Inf.
