@@ -11,7 +11,7 @@ from conftest import Dfsm
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, differentiate
 from dfsm.data.info import counted, describe
 from dfsm.data.readers import read
-from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrapping
+from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrap_notes, wrapping
 from dfsm.data.slower import fill_slower
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
@@ -127,6 +127,10 @@ def test_angles_that_wrap_are_no_states():
     with pytest.raises(DfsmError, match=r"state 'Azimuth' wraps at 360 deg \(3 times, first at"):
         differentiate(run, [StateSpec(name="Azimuth")], DerivativeSettings())
     assert "'Azimuth' wraps at 360 deg, 3 times" in describe(run).warnings[-1]
+    # As an input or output of a fit it is told.
+    (told,) = wrap_notes([run.with_channels("u", np.sin(T)), run], ["Azimuth"])
+    assert told.startswith("run: 'Azimuth' wraps at 360 (3 times, first at ")
+    assert wrap_notes([run.with_channels("u", np.sin(T))], ["u"]) == []
 
 
 def test_held_values_and_bad_starts():

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
 from dfsm.core.units import factor, known
+
+if TYPE_CHECKING:
+    from dfsm.data.trajectory import Trajectory
 
 # Fewer samples than this show nothing.
 _FEWEST = 20
@@ -57,6 +62,21 @@ def wrapping(time: Array, values: Array, unit: str) -> Wrap | None:
         if turns.any() and 0 < usual < period / 4 and moved.max() <= 2 * usual:
             return Wrap(period, int(turns.sum()), float(time[1:][turns][0]))
     return None
+
+
+def wrap_notes(runs: Sequence[Trajectory], names: Iterable[str]) -> list[str]:
+    """Say of which inputs and outputs of a fit wrap, each where it does first."""
+    told = []
+    for name in dict.fromkeys(names):
+        found = ((r, wrapping(r.time, r[name], r.channel(name).unit)) for r in runs)
+        if first := next(((run, wrap) for run, wrap in found if wrap), None):
+            run, wrap = first
+            told.append(
+                f"{run.where}: '{name}' wraps at {wrap.period:.4g} ({wrap.times} times, first at "
+                f"{wrap.first:g} s), and a fit takes such a jump for motion: unwrap it "
+                "(numpy.unwrap), or give its sine and cosine"
+            )
+    return told
 
 
 def _turns(unit: str) -> list[float]:

@@ -29,7 +29,7 @@ from dfsm.data.derivatives import (
 )
 from dfsm.data.features import unknown_until
 from dfsm.data.info import gap_warning
-from dfsm.data.signs import held_interval
+from dfsm.data.signs import held_interval, wrap_notes
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
 from dfsm.data.stuck import stuck_notes
@@ -123,12 +123,16 @@ class Samples:
     @property
     def output_inputs(self) -> Array:
         """[I, φ, harmonics], what linear fits of outputs take."""
+        if not self.harmonics.shape[1]:
+            return self.linear_inputs
         return np.concatenate([self.linear_inputs, self.harmonics], axis=1)
 
     def without_terms(self, inputs: Array) -> Array:
         """What corrective functions take of what linear fits do: all but φ."""
+        if self.terms is None:
+            return inputs
         n = self.inputs.shape[1]
-        after = n if self.terms is None else n + len(self.terms.channels)
+        after = n + len(self.terms.channels)
         return np.concatenate([inputs[:, :n], inputs[:, after:]], axis=1)
 
     def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
@@ -224,6 +228,7 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
                 f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
                 "model: leave it out, or add runs in which it varies"
             )
+    warnings += wrap_notes(data, (*settings.controls, *settings.driving, *settings.outputs))
     names = data.names
     for run in data:
         window = run.window(settings.start, settings.stop)
