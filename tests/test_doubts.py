@@ -123,6 +123,10 @@ def test_an_input_that_acts_late_is_named_and_a_delay_mends_it():
     assert "'u' acts late on it (x_dot)" in entry["text"]
     assert "x_dot: 'u' acts about " in notes[0]
     assert abs(float(notes[0].split("about ")[1].split(" s")[0]) - 7) < 0.3
+    # Told of a single sample, too, and not where there is no delay.
+    _, (note,) = told([delayed(1)])
+    assert abs(float(note.split("'u' acts about ")[1].split(" s")[0]) - 1) < 0.1
+    quietly([delayed(0)])
     late = FitSettings(
         states=SETTINGS.states,
         controls=("u",),

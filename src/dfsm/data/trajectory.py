@@ -25,7 +25,7 @@ from dfsm.numerics.time_mesh import instants_apart, own_interval, time_step
 
 if TYPE_CHECKING:
     import pandas as pd
-    import xarray as xr
+    import xarray as xr  # pyright: ignore[reportMissingImports]
 
 
 __all__ = ["Channel", "Role", "Trajectory", "labels"]

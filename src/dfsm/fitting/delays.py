@@ -15,8 +15,12 @@ from dfsm.core.types import Array
 from dfsm.fitting.residuals import Residuals, stacked
 
 # A row is looked at where more than this is unexplained, and a delay told where it leaves at most
-# this share of the residual's variance.
-_UNEXPLAINED, _LEAVES = 0.1, 0.25
+# this share of the residual's variance; of a residual below a tenth it must leave less.
+_UNEXPLAINED, _LEAVES = 0.02, 0.25
+_SMALL, _LEAVES_OF_SMALL = 0.1, 0.1
+# Share of a sampling interval below which it is no delay: half of one is what a held input, taken
+# for a line, seems to be late or early.
+_LATE = 0.75
 # Intervals below which chance explains as much, delays tried, and the longest relative to a run.
 _FEWEST, _TRIED, _LONGEST = 150, 40, 0.2
 
@@ -33,11 +37,14 @@ class LateInput:
         The delay that explains most.
     unexplained
         What is left with it, relative to the derivative's standard deviation.
+    small
+        Whether little is unexplained without it, too.
     """
 
     column: int
     seconds: float
     unexplained: float
+    small: bool
 
 
 def late_input(residuals: Residuals, columns: range) -> LateInput | None:
@@ -54,7 +61,11 @@ def late_input(residuals: Residuals, columns: range) -> LateInput | None:
     if residuals.unexplained <= _UNEXPLAINED or sum(sizes) < _FEWEST:
         return None
     longest = _LONGEST * min(sizes)
-    grid = np.unique(np.concatenate([[1.0], np.geomspace(1, max(longest, 1), _TRIED)]))
+    head = [0.0, 0.1, 0.25, 0.5, 0.75]
+    grid = np.unique(np.concatenate([head, np.geomspace(1, max(longest, 1), _TRIED)]))
+    shortest = _LATE * (residuals.sample or residuals.step) / residuals.step
+    small = residuals.unexplained <= _SMALL
+    share = _LEAVES_OF_SMALL if small else _LEAVES
     delayed = _Delayed(residuals)
     now, best = delayed.left(), None
     for column in columns:
@@ -64,14 +75,14 @@ def late_input(residuals: Residuals, columns: range) -> LateInput | None:
         finer = [delayed.left(column, lag) for lag in around]
         lag, least = float(around[int(np.argmin(finer))]), min(finer)
         # At the end of the grid it is no delay that is sought, at its head no delay at all.
-        inside = k < len(grid) - 1 and lag > 1
-        if inside and least < _LEAVES * now and (best is None or least < best[1]):
+        inside = k < len(grid) - 1 and lag >= shortest
+        if inside and least < share * now and (best is None or least < best[1]):
             best = (column, least, lag)
     if best is None:
         return None
     spread = float(stacked(residuals.targets).std())
     column, least, lag = best
-    return LateInput(column, lag * residuals.step, float(np.sqrt(least)) / spread)
+    return LateInput(column, lag * residuals.step, float(np.sqrt(least)) / spread, small)
 
 
 class _Delayed:

@@ -143,9 +143,9 @@ def doubts(
             )
         if series is not None and (found := late_input(series, range(driving))):
             notes.append(late_note(name, names[found.column], found, series.unexplained))
-            reasons.append(
-                Reason(name, "late", f"'{names[found.column]}' acts late on it", "the delay told")
-            )
+            # A delay that costs little is no reason against the model.
+            late = f"'{names[found.column]}' acts late on it"
+            reasons += [Reason(name, "late", late, "the delay told")] * (not found.small)
         elif series is not None and fit.model.schedule is None:
             free = [c for c in range(len(samples.signals.controls)) if c not in held]
             for twice in pulled(series, free):

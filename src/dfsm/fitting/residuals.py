@@ -31,12 +31,15 @@ class Residuals:
     inputs, targets, left
         What the fit takes, the derivative, and what the fit leaves of it: per run
         ``(interval, input)`` and ``(interval,)``.
+    sample
+        Usual distance of the samples in s; 0 where nobody says.
     """
 
     step: float
     inputs: tuple[Array, ...]
     targets: tuple[Array, ...]
     left: tuple[Array, ...]
+    sample: float = 0.0
 
     @property
     def unexplained(self) -> float:
@@ -51,7 +54,7 @@ class Residuals:
             tuple(v - v.mean(axis=0) for v in part)
             for part in (self.inputs, self.targets, self.left)
         )
-        return Residuals(self.step, inputs, targets, left)
+        return Residuals(self.step, inputs, targets, left, self.sample)
 
 
 def residuals_of(
@@ -72,7 +75,7 @@ def residuals_of(
         None where all runs are too short to tell anything: fewer than 4 intervals per input.
     """
     parts = list(_split(runs))
-    step = min(float(np.median(np.diff(time[part]))) for part in parts)
+    step = sample = min(float(np.median(np.diff(time[part]))) for part in parts)
     memory = float(np.mean([_memory(time[part], left[part]) for part in parts]))
     together = sum(float(time[part][-1] - time[part][0]) for part in parts)
     step = max(step, memory / _PER_CORRELATION, together / _MOST)
@@ -89,6 +92,7 @@ def residuals_of(
         tuple(m[:, :-2] for m in means),
         tuple(m[:, -2] for m in means),
         tuple(m[:, -1] for m in means),
+        sample,
     )
 
 

@@ -352,8 +352,9 @@ def _places(data: Dataset, settings: FitSettings) -> dict[str, Array]:
         "harmonics": blades,
         "field": len(azimuth.field) if azimuth else 0,
     }
-    tables = {name: np.zeros((count, width)) for name, width in widths.items()}
-    return tables | {"psi": np.zeros(count)}
+    tables: dict[str, Array] = {n: np.zeros((count, width)) for n, width in widths.items()}
+    tables["psi"] = np.zeros(count)
+    return tables
 
 
 def _rough(data: Dataset, signals: SignalTable, settings: FitSettings) -> tuple[str, ...]:
