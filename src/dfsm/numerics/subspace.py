@@ -16,8 +16,10 @@ from scipy.linalg import logm, svd
 
 from dfsm.core.types import Array
 
-# Eigenvalues of a step lie between: what does not decay, or flips sign, is taken for noise.
-_SLOWEST, _FASTEST = 0.9995, 0.02
+# What does not decay in a step, or flips sign, is taken for noise.
+_SLOWEST = 0.9995
+# Largest size of an eigenvalue of the rate, per step: RK4 diverges from 2.8 on.
+_FASTEST = 2.2
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Observability:
     outputs: int
 
     def system(self, order: int) -> tuple[Array, Array]:
-        """A of one step, with eigenvalues inside the unit circle, and C."""
+        """A of one step, of modes that decay, no faster than RK4 can follow, and C."""
         G, p = self.matrix[:, :order], self.outputs
         A = np.linalg.lstsq(G[:-p], G[p:], rcond=None)[0]
         found: Any = np.linalg.eig(A)
@@ -47,7 +49,9 @@ class Observability:
         size = np.abs(values)
         values = np.where(size > _SLOWEST, values / np.maximum(size, _SLOWEST) * _SLOWEST, values)
         real = np.abs(values.imag) < 1e-9
-        values = np.where(real & (values.real < _FASTEST), _FASTEST, values)
+        values = np.where(real & (values.real < np.exp(-_FASTEST)), np.exp(-_FASTEST), values)
+        rates = np.log(values)
+        values = np.exp(rates * np.minimum(1.0, _FASTEST / np.maximum(np.abs(rates), 1e-12)))
         A = (vectors @ np.diag(values) @ np.linalg.pinv(vectors)).real
         return A, G[:p]
 

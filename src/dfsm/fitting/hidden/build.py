@@ -218,8 +218,12 @@ def _corrective(
     (places, rate), (shift, scale) = to, map(jnp.asarray, standard)
     if form.kind == "polynomial":
         columns = [*places.tolist(), len(places)]
-        factors = tuple(tuple(columns[c] for c in f) for f in form.factors)
-        return Polynomial(shift, scale, jnp.asarray(rate[:, None] * parts[0]), factors)
+        used = np.flatnonzero(np.any(parts[0] != 0, axis=0))
+        if not len(used):
+            return None
+        factors = tuple(tuple(columns[c] for c in form.factors[k]) for k in used)
+        weights = jnp.asarray(rate[:, None] * parts[0][:, used])
+        return Polynomial(shift, scale, weights, factors, form.reach)
     if form.kind == "tanh":
         directions = np.zeros((form.units, len(places)))
         directions[:, places] = parts[0][:, :-1]
@@ -241,7 +245,7 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
     off = f"{np.sqrt(found.best.error):.3g} standard deviations"
     plural = "s" * (count != 1)
     kind = {"none": "a linear equation", "tanh": f"{form.units} tanh units in all rows"}.get(
-        form.kind, f"a polynomial of degree {_degree(form)} in all rows"
+        form.kind, _polynomial_told(form)
     )
     checks = [
         f"{count} hidden state{plural} and {kind}: rollouts are off by {off} "
@@ -264,8 +268,12 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
     return _doubts(found, hidden), checks
 
 
-def _degree(form: Form) -> int:
-    return max((sum(c < form.width for c in f) for f in form.factors), default=1)
+def _polynomial_told(form: Form) -> str:
+    full = form.states * len(form.factors)
+    kept = range(full) if form.kept is None else form.kept
+    columns = {k % max(1, len(form.factors)) for k in kept}
+    degree = max((sum(c < form.width for c in form.factors[k]) for k in columns), default=1)
+    return f"a polynomial of degree {degree} with {len(kept)} of {full} coefficients"
 
 
 def _doubts(found: Found, hidden: HiddenSettings) -> list[str]:

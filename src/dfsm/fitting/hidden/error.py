@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,12 +21,15 @@ from dfsm.core.types import Array
 from dfsm.fitting.hidden.form import Form
 from dfsm.fitting.hidden.windows import Windows
 
-# Numbers in the slopes of one batch of windows.
-_BATCH = 6_000_000
+# Samples of one batch of windows: all batches have one shape, so that they are compiled once, and
+# memory does not grow with the data.
+BATCH = 3200
+# A state whose rate per sample is no more than this share of its spread does not move.
+_STILL = 1e-6
 
 
 class HiddenError:
-    """What is to be made small: Σ |y - ŷ|² over what trains, and a little decay of the parameters.
+    """What is to be made small: Σ |y - ŷ|² over what trains, and a decay of the parameters.
 
     The vector of weights holds the parameters of the form, then the states at the start of each
     window.
@@ -37,15 +41,23 @@ class HiddenError:
     windows
         Records.
     decay
-        Weight of the squared parameters.
+        Weights of the squared parameters, one for all or ``(parameter,)``.
     """
 
-    def __init__(self, form: Form, windows: Windows, decay: float = 0.0) -> None:
+    def __init__(self, form: Form, windows: Windows, decay: Array | float = 0.0) -> None:
         self.form, self.windows, self._decay = form, windows, decay
         count, samples = windows.used.shape
-        numbers = samples * form.states * (form.size + form.states)
-        each = max(1, min(-(-count // 2), _BATCH // max(1, numbers)))
+        each = max(1, min(count, BATCH // samples))
         self._batches = [slice(i, min(i + each, count)) for i in range(0, count, each)]
+        self._size = each
+        n, room = form.states, max(form.room, form.states)
+        # The form that is computed, and where the parameters and states are among its own.
+        self._computed = replace(form, states=room, room=0)
+        self._places = np.arange(form.size)
+        if room > n:
+            columns = np.concatenate([np.arange(n), room + np.arange(form.inputs + 1)])
+            width = self._computed.width + 1
+            self._places = (width * np.arange(n)[:, None] + columns).ravel()
 
     @property
     def size(self) -> int:
@@ -54,11 +66,24 @@ class HiddenError:
 
     def paths(self, weights: Array) -> Array:
         """States along all windows, ``(window, time, state)``."""
-        return np.concatenate(self._each(partial(_paths, self.form), weights))
+        paths = np.concatenate(self._each(partial(_paths, self._computed), weights))
+        return paths[..., : self.form.states]
+
+    def rates(self, weights: Array) -> Array:
+        """Spreads of the rates of the states along all windows, ``(state,)``."""
+        inside = self.windows.h > 0
+        moved = np.diff(self.paths(weights), axis=1)[inside] / self.windows.h[inside][:, None]
+        spread = np.sqrt(np.mean(moved**2, axis=0))
+        return np.where(np.isfinite(spread) & (spread > _STILL), spread, 1.0)
 
     def left_out(self, weights: Array) -> float:
         """Mean square of the errors where data are left out; 1 is as wrong as a constant."""
         return self._mean(weights, self.windows.left_out)
+
+    def squares_left_out(self, weights: Array) -> Array:
+        """Squared errors where data are left out, in the order of windows and time."""
+        r = self.paths(weights)[..., : self.form.outputs] - self.windows.y
+        return np.sum(r**2, axis=-1)[self.windows.left_out > 0]
 
     def trained(self, weights: Array) -> float:
         """Mean square of the errors that train."""
@@ -68,20 +93,21 @@ class HiddenError:
         """All that is to be made small; infinite where a rollout is not finite."""
         p = weights[: self.form.size]
         total = self._squares(weights, self.windows.used)
-        return total + self._decay * float(p @ p) if np.isfinite(total) else np.inf
+        return total + float(np.sum(self._decay * p**2)) if np.isfinite(total) else np.inf
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
         """JᵀJ and Jᵀr."""
         n, p = self.form.states, self.form.size
         JtJ, Jtr = np.zeros((self.size, self.size)), np.zeros(self.size)
         whole = np.arange(p)
+        there = np.concatenate([self._places, self._computed.size + np.arange(n)])
         for rows, part in zip(
-            self._batches, self._each(_products_of(self.form), weights), strict=True
+            self._batches, self._each(_products_of(self._computed), weights), strict=True
         ):
             for i, (own, slope) in enumerate(zip(*map(np.asarray, part), strict=True), rows.start):
                 at = np.concatenate([whole, p + n * i + np.arange(n)])
-                JtJ[np.ix_(at, at)] += own
-                Jtr[at] += slope
+                JtJ[np.ix_(at, at)] += own[np.ix_(there, there)]
+                Jtr[at] += slope[there]
         JtJ[whole, whole] += self._decay
         Jtr[whole] += self._decay * weights[:p]
         return JtJ, Jtr
@@ -97,14 +123,21 @@ class HiddenError:
     def _each(self, function: Callable[..., Any], weights: Array) -> list[Any]:
         """The results of all batches, several at a time."""
         p = self.form.size
-        theta, starts = jnp.asarray(weights[:p]), weights[p:].reshape(-1, self.form.states)
+        own = weights[p:].reshape(-1, self.form.states)
+        starts = np.pad(own, ((0, 0), (0, self._computed.states - self.form.states)))
+        parameters = np.zeros(self._computed.size)
+        parameters[self._places] = weights[:p]
+        theta = jnp.asarray(parameters)
 
         def one(rows: slice) -> Any:
-            w = self.windows.part(rows)
-            return function(theta, starts[rows], w.h, w.v, w.y, w.used)
+            # The last batch is filled up with its last window.
+            at = np.minimum(np.arange(rows.start, rows.start + self._size), rows.stop - 1)
+            w = self.windows.part(at)
+            part = function(theta, starts[at], w.h, w.v, w.y, w.used)
+            return jax.tree.map(lambda a: np.asarray(a)[: rows.stop - rows.start], part)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            return [jax.tree.map(np.asarray, part) for part in pool.map(one, self._batches)]
+            return list(pool.map(one, self._batches))
 
 
 def _products_of(form: Form) -> Callable[..., Any]:

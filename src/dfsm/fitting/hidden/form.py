@@ -9,7 +9,8 @@ difference d of any two rollouts then falls by exp(-2 ε t) at least.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import factorial
 from typing import Literal
 
 import jax
@@ -44,6 +45,14 @@ class Form:
         P, row by row, where stability is asked for.
     margin
         ε per typical step, beside `metric`.
+    reach
+        Standard deviations beyond which an input of the polynomial counts as if it were there.
+    kept
+        Which coefficients of the polynomial there are, by their places in ``(state, monomial)`` row
+        by row; None for all.
+    room
+        States that linear rollouts are computed with, so that systems of all sizes share compiled
+        code; those that there are not stay at zero.
     """
 
     states: int
@@ -54,6 +63,9 @@ class Form:
     factors: tuple[tuple[int, ...], ...] = ()
     metric: tuple[tuple[float, ...], ...] = ()
     margin: float = 0.0
+    reach: float = REACH
+    kept: tuple[int, ...] | None = None
+    room: int = 0
 
     @property
     def width(self) -> int:
@@ -65,7 +77,8 @@ class Form:
         """Of the parameter arrays: [A, B, b] first."""
         linear = [(self.states, self.width + 1)]
         if self.kind == "polynomial":
-            return [*linear, (self.states, len(self.factors))]
+            whole = (self.states, len(self.factors))
+            return [*linear, whole if self.kept is None else (len(self.kept),)]
         if self.kind == "tanh":
             return [*linear, (self.units, self.width + 1), (self.states, self.units)]
         return linear
@@ -75,6 +88,31 @@ class Form:
         """Number of parameters."""
         return sum(int(np.prod(s)) for s in self.shapes)
 
+    def spreads(self, rates: Array) -> Array:
+        """How far parameters are expected from zero, ``(parameter,)``.
+
+        A coefficient changes a rate by about the spread of that rate, the more factors the less, as
+        in Taylor's series; units look along directions of length one.
+
+        Parameters
+        ----------
+        rates
+            Spreads of ẋ, ``(state,)``.
+        """
+        linear = np.repeat(rates[:, None], self.width + 1, axis=1)
+        if self.metric:
+            # There it holds a square root and skew entries instead of A.
+            linear[:, : self.states] = np.sqrt(rates)[:, None]
+        parts = [linear]
+        if self.kind == "polynomial":
+            orders = [sum(c < self.width for c in f) for f in self.factors]
+            whole = np.outer(rates, [1 / factorial(k) for k in orders])
+            parts.append(whole if self.kept is None else whole.ravel()[list(self.kept)])
+        elif self.kind == "tanh":
+            parts.append(np.ones((self.units, self.width + 1)))
+            parts.append(np.repeat(rates[:, None], self.units, axis=1))
+        return np.concatenate([part.ravel() for part in parts])
+
     def parts(self, weights: jax.Array | Array) -> list[jax.Array]:
         """The parameter arrays as the equation takes them, A as it is in the equation."""
         raw, start = [], 0
@@ -82,6 +120,10 @@ class Form:
             count = int(np.prod(shape))
             raw.append(jnp.reshape(weights[start : start + count], shape))
             start += count
+        if self.kept is not None:
+            whole = jnp.zeros(self.states * len(self.factors))
+            whole = whole.at[np.array(self.kept, dtype=int)].set(raw[1])
+            raw[1] = whole.reshape(self.states, len(self.factors))
         if self.metric:
             raw[0] = jnp.concatenate([self._contracting(raw), raw[0][:, self.states :]], axis=1)
         return raw
@@ -102,7 +144,7 @@ class Form:
         z = jnp.concatenate([x, v])
         total = parts[0][:, :-1] @ z + parts[0][:, -1]
         if self.kind == "polynomial":
-            return total + parts[1] @ products(jnp.clip(z, -REACH, REACH), self.factors)
+            return total + parts[1] @ products(jnp.clip(z, -self.reach, self.reach), self.factors)
         if self.kind == "tanh":
             return total + parts[2] @ jnp.tanh(parts[1][:, :-1] @ z + parts[1][:, -1])
         return total
@@ -124,14 +166,19 @@ class Form:
             Inputs at the start, middle and end of every step in it, ``(step, 3, input)``.
         """
         rate = lambda x, v: self.rate(parts, x, v)  # noqa: E731
-        for k in range(v.shape[0]):
-            x, _ = rk4_step(rate, x, h / v.shape[0], (v[k, 0], v[k, 1], v[k, 2]))
+
+        def step(x: jax.Array, v: jax.Array) -> tuple[jax.Array, None]:
+            return rk4_step(rate, x, h / steps, (v[0], v[1], v[2]))[0], None
+
+        steps = v.shape[0]
+        # One body, however many steps: what is compiled stays small.
+        x = step(x, v[0])[0] if steps == 1 else jax.lax.scan(step, x, v)[0]
         return jnp.clip(x, -_FAR, _FAR)
 
 
-def polynomial(form: Form, degree: int, most: int) -> Form:
+def polynomial(form: Form, degree: int, most: int, reach: float) -> Form:
     """The form with a polynomial, of a lower degree where there would be too many monomials."""
     while degree > 2 and len(monomials(form.width, degree)) > most:
         degree -= 1
     factors = monomials(form.width, degree)
-    return Form(form.states, form.outputs, form.inputs, "polynomial", 0, factors)
+    return replace(form, kind="polynomial", factors=factors, reach=reach, room=0)

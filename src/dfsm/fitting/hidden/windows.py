@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.simulation.integrate import stages_of
@@ -61,9 +61,24 @@ class Windows:
         """Inputs as if time ran back: of the same kind, in an order that never was."""
         return replace(self, h=self.h[:, ::-1], v=self.v[:, ::-1, ::-1, ::-1])
 
-    def part(self, rows: slice) -> Windows:
+    def part(self, rows: slice | IntArray) -> Windows:
         """Some of the windows."""
         return Windows(*(getattr(self, n)[rows] for n in _FIELDS))
+
+    def heads(self, samples: int) -> Windows:
+        """The first samples of every window."""
+        cut = {n: getattr(self, n)[:, : samples - 1] for n in ("h", "v")}
+        return replace(
+            self, **cut, **{n: getattr(self, n)[:, :samples] for n in ("y", "used", "left_out")}
+        )
+
+    def turned(self) -> Windows:
+        """The same with other stretches left out, those half a round later."""
+        inside = (self.used + self.left_out) > 0
+        judged = np.zeros_like(self.used)
+        for row, here in zip(judged, inside, strict=True):
+            row[here] = _judged(int(here.sum()), len(self.y), turn=0.5)
+        return replace(self, used=inside - judged, left_out=judged)
 
 
 _FIELDS = ("y", "h", "v", "used", "left_out", "first")
@@ -138,12 +153,12 @@ def _edges(samples: int, length: int) -> Array:
     return np.linspace(0, samples - 1, pieces + 1).round().astype(int)
 
 
-def _judged(samples: int, windows: int) -> Array:
+def _judged(samples: int, windows: int, turn: float = 0.0) -> Array:
     """Which samples of a window are left out: some stretches of a long one, the ends of many."""
     at = np.arange(samples) / samples
     if windows > _FEW:
-        return (at >= 1 - _LEFT_OUT).astype(float)
-    return (at * _PLACES % 1 >= 1 - _LEFT_OUT).astype(float)
+        return ((at + turn) % 1 >= 1 - _LEFT_OUT).astype(float)
+    return ((at * _PLACES + turn) % 1 >= 1 - _LEFT_OUT).astype(float)
 
 
 def _stages(

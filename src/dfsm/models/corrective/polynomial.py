@@ -18,8 +18,8 @@ import numpy as np
 
 from dfsm.models.corrective.form import Corrective
 
-# Beyond as many standard deviations from its middle, an input counts as if it were there: nothing
-# that was recorded tells how a polynomial goes on.
+# Beyond as many standard deviations from its middle, an input counts as if it were there, unless a
+# fit says where its data ended: nothing that was recorded tells how a polynomial goes on.
 REACH = 4.0
 
 
@@ -49,15 +49,18 @@ class Polynomial(Corrective):
         Of each monomial in each target, in the target's unit, shape ``(target, monomial)``.
     factors
         Columns that each monomial multiplies; the number of inputs stands for one.
+    reach
+        Standard deviations beyond which an input counts as if it were there.
     """
 
     kind = "polynomial"
     weights: jax.Array
     factors: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    reach: float = eqx.field(static=True, default=REACH)
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """Evaluate at one input vector, shape ``(input,)`` to ``(target,)``."""
-        z = jnp.clip((inputs - self.shift) / self.scale, -REACH, REACH)
+        z = jnp.clip((inputs - self.shift) / self.scale, -self.reach, self.reach)
         return self.weights @ products(z, self.factors)
 
     def select(self, rows: Sequence[int]) -> Polynomial:
@@ -85,8 +88,9 @@ class Polynomial(Corrective):
         return replace(self, weights=self.weights + spread[:, None] * deviations[0])
 
     def structure(self) -> dict[str, Any]:
-        """Kind, and what the monomials multiply."""
-        return {"kind": self.kind, "factors": [list(f) for f in self.factors]}
+        """Kind, what the monomials multiply, and how far they go."""
+        factors = [list(f) for f in self.factors]
+        return {"kind": self.kind, "factors": factors, "reach": self.reach}
 
     def arrays(self) -> dict[str, jax.Array]:
         """Shift, scale and weights."""
@@ -99,6 +103,5 @@ class Polynomial(Corrective):
         inputs = arrays["shift"].shape[0]
         if any(not 0 <= c <= inputs for f in factors for c in f):
             raise ValueError(f"factors, of which one is no column of {inputs} inputs")
-        return cls(
-            shift=arrays["shift"], scale=arrays["scale"], weights=arrays["weights"], factors=factors
-        )
+        reach = float(structure.get("reach", REACH))
+        return cls(arrays["shift"], arrays["scale"], arrays["weights"], factors, reach)
