@@ -24,6 +24,8 @@ from dfsm.models.signals import Provenance
 
 # Samples of the past from which hidden states are told, and fewest samples per parameter.
 _STARTUP, _FEWEST = 50, 20
+# Share of the usual interval by which another may differ.
+_UNEVEN = 0.05
 # A measured state that is another one late, to so small a share of its variance.
 _DELAYED, _LAGS = 1e-6, 50
 # Of what a further hidden state must gain to be no more than the data can tell.
@@ -79,6 +81,7 @@ def fit_hidden(model: DFSM, data: Dataset, settings: FitSettings, hidden: Hidden
     s = model.signals
     names = (*s.names("states"), *s.exogenous)
     records = [r.window(settings.start, settings.stop).select(names) for r in data]
+    _require_even(records)
     for record in records:
         _require_apart(record, s.names("states"))
     startup = _startup(records, hidden)
@@ -125,6 +128,19 @@ def _startup(records: list[Trajectory], hidden: HiddenSettings) -> float:
             f"{shortest.duration:g} s: choose a shorter one, or leave the run out"
         )
     return hidden.startup
+
+
+def _require_even(records: list[Trajectory]) -> None:
+    """Refuse uneven times: what is told of a start, and of a step, is meant per sample."""
+    step = float(np.median(np.concatenate([np.diff(r.time) for r in records])))
+    for record in records:
+        apart = np.diff(record.time)
+        if np.abs(apart - step).max() > _UNEVEN * step:
+            raise DfsmError(
+                f"{record.where} has samples {apart.min():.6g} to {apart.max():.6g} s apart, where "
+                f"{step:.6g} s are usual: hidden states are fitted on even samples of one interval "
+                "in all runs, so resample it, or leave it out"
+            )
 
 
 def _require_enough(
@@ -218,11 +234,8 @@ def _corrective(
     (places, rate), (shift, scale) = to, map(jnp.asarray, standard)
     if form.kind == "polynomial":
         columns = [*places.tolist(), len(places)]
-        used = np.flatnonzero(np.any(parts[0] != 0, axis=0))
-        if not len(used):
-            return None
-        factors = tuple(tuple(columns[c] for c in form.factors[k]) for k in used)
-        weights = jnp.asarray(rate[:, None] * parts[0][:, used])
+        factors = tuple(tuple(columns[c] for c in f) for f in form.factors)
+        weights = jnp.asarray(rate[:, None] * parts[0])
         return Polynomial(shift, scale, weights, factors, form.reach)
     if form.kind == "tanh":
         directions = np.zeros((form.units, len(places)))
@@ -245,7 +258,7 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
     off = f"{np.sqrt(found.best.error):.3g} standard deviations"
     plural = "s" * (count != 1)
     kind = {"none": "a linear equation", "tanh": f"{form.units} tanh units in all rows"}.get(
-        form.kind, _polynomial_told(form)
+        form.kind, f"a polynomial of degree {_degree(form)} in all rows"
     )
     checks = [
         f"{count} hidden state{plural} and {kind}: rollouts are off by {off} "
@@ -268,12 +281,8 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
     return _doubts(found, hidden), checks
 
 
-def _polynomial_told(form: Form) -> str:
-    full = form.states * len(form.factors)
-    kept = range(full) if form.kept is None else form.kept
-    columns = {k % max(1, len(form.factors)) for k in kept}
-    degree = max((sum(c < form.width for c in form.factors[k]) for k in columns), default=1)
-    return f"a polynomial of degree {degree} with {len(kept)} of {full} coefficients"
+def _degree(form: Form) -> int:
+    return max((sum(c < form.width for c in f) for f in form.factors), default=1)
 
 
 def _doubts(found: Found, hidden: HiddenSettings) -> list[str]:

@@ -47,9 +47,6 @@ class Form:
         ε per typical step, beside `metric`.
     reach
         Standard deviations beyond which an input of the polynomial counts as if it were there.
-    kept
-        Which coefficients of the polynomial there are, by their places in ``(state, monomial)`` row
-        by row; None for all.
     room
         States that linear rollouts are computed with, so that systems of all sizes share compiled
         code; those that there are not stay at zero.
@@ -64,7 +61,6 @@ class Form:
     metric: tuple[tuple[float, ...], ...] = ()
     margin: float = 0.0
     reach: float = REACH
-    kept: tuple[int, ...] | None = None
     room: int = 0
 
     @property
@@ -77,8 +73,7 @@ class Form:
         """Of the parameter arrays: [A, B, b] first."""
         linear = [(self.states, self.width + 1)]
         if self.kind == "polynomial":
-            whole = (self.states, len(self.factors))
-            return [*linear, whole if self.kept is None else (len(self.kept),)]
+            return [*linear, (self.states, len(self.factors))]
         if self.kind == "tanh":
             return [*linear, (self.units, self.width + 1), (self.states, self.units)]
         return linear
@@ -106,8 +101,7 @@ class Form:
         parts = [linear]
         if self.kind == "polynomial":
             orders = [sum(c < self.width for c in f) for f in self.factors]
-            whole = np.outer(rates, [1 / factorial(k) for k in orders])
-            parts.append(whole if self.kept is None else whole.ravel()[list(self.kept)])
+            parts.append(np.outer(rates, [1 / factorial(k) for k in orders]))
         elif self.kind == "tanh":
             parts.append(np.ones((self.units, self.width + 1)))
             parts.append(np.repeat(rates[:, None], self.units, axis=1))
@@ -120,10 +114,6 @@ class Form:
             count = int(np.prod(shape))
             raw.append(jnp.reshape(weights[start : start + count], shape))
             start += count
-        if self.kept is not None:
-            whole = jnp.zeros(self.states * len(self.factors))
-            whole = whole.at[np.array(self.kept, dtype=int)].set(raw[1])
-            raw[1] = whole.reshape(self.states, len(self.factors))
         if self.metric:
             raw[0] = jnp.concatenate([self._contracting(raw), raw[0][:, self.states :]], axis=1)
         return raw

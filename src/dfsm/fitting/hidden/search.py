@@ -18,7 +18,6 @@ from dfsm.fitting.hidden.error import HiddenError
 from dfsm.fitting.hidden.form import Form
 from dfsm.fitting.hidden.race import forms, promising, raced
 from dfsm.fitting.hidden.settings import HiddenSettings
-from dfsm.fitting.hidden.sparse import sparse
 from dfsm.fitting.hidden.starts import (
     Candidate,
     contracting,
@@ -109,7 +108,6 @@ def search(
     best, tried = raced(linear, windows, settings, seed)
     best, steps = _steps(records, standard, best, kinds, settings)
     finer = windows_of(records, standard, kinds, steps, settings.samples)
-    best = sparse(best, finer, settings.decay)
     everything = windows_of(records, standard, kinds, steps).with_all()
     error = best.error
     weights = restarted(best, finer, everything)
