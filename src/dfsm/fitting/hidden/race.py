@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,6 +30,8 @@ from dfsm.fitting.hidden.windows import Windows
 from dfsm.models.corrective.polynomial import REACH
 
 Tried = list[tuple[str, int, float]]
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 # A further hidden state must lower the squared error on data left out to this share.
 _WORTH_A_STATE = 0.75
 # Linear systems whose squared error is no more than so many times the least may be enough.
@@ -122,7 +125,7 @@ def _of_every_kind(ahead: list[int], entries: Sequence[tuple[Form, int]]) -> lis
     return [k for k in ahead if k in ahead[:_AHEAD] or k in kinds.values()]
 
 
-def _each(function: Callable[..., Candidate], tasks: Sequence[object]) -> list[Candidate]:
+def _each(function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(function, tasks))
 
