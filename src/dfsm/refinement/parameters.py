@@ -192,7 +192,8 @@ class Parametrization(eqx.Module):
                 moved = self._terms(parts)
                 return jnp.zeros(0) if moved is None else moved(inputs)
 
-            by_part = jax.jacfwd(values)(terms)
+            # Backwards: a term has few values and dozens of parameters.
+            by_part = jax.jacrev(values)(terms)
             J = jnp.concatenate([p.reshape(p.shape[0], -1) for p in by_part], axis=1)
             L, _ = model.f.at(inputs[model.f.schedule or 0])
             return L[:observed, first:] @ J
