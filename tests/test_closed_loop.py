@@ -257,10 +257,23 @@ def test_what_does_not_fit_is_told_in_one_sentence(model):
             r"sets 'u9', which is no control of the model; known are: u0, u1",
         ),
         (replace(GAINS, measurement_units=("rpm", "deg/s")), {}, r"'q' is in 'deg' .* 'rpm'"),
+        (_Raises(GAINS.k), {}, r"controller's step fails with KeyError: 'mine'"),
+        (OnHost(_Raises(GAINS.k)), {}, r"controller's step at 0 s fails with KeyError: 'mine'"),
+        (OnHost(_Long(GAINS.k)), {}, r"commands of shape \(2,\), expected \(1,\)"),
         (_Bad(GAINS.k), {}, r"state of shapes \[\] into one of \[\(2,\)\]"),
     ):
         with pytest.raises(DfsmError, match=sentence):
             quietly(model, run, law, measurements=names, settings=AT_ONCE)
+
+
+class _Raises(Feedback):
+    def step(self, state: Any, measurements: Any, time: Any) -> Any:
+        raise KeyError("mine")
+
+
+class _Long(Feedback):
+    def step(self, state: Any, measurements: Any, time: Any) -> Any:
+        return state, jnp.zeros(2)
 
 
 class _Bad(Feedback):

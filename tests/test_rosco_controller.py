@@ -193,6 +193,7 @@ def test_what_is_not_implemented_is_refused_by_key(tmp_path):
         ({"PerfTableSize": "17 13"}, r"PerfTableSize is \[17, 13\], and .* has \[18, 13\]"),
         ({"F_TwrTopNotch_Ind": "3"}, "F_TwrTopNotch_Ind names notch filter 3 of 2"),
         ({"PS_WindSpeeds": "3 7 7 25"}, "PS_WindSpeeds does not rise"),
+        ({"PC_GS_KI": "-1 nan -1 -1"}, "PC_GS_KI holds nan, expected finite numbers"),
         ({"VS_RtTq": "1.9e7x"}, "VS_RtTq is '1.9e7x', expected numbers"),
     ],
 )

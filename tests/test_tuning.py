@@ -89,7 +89,7 @@ def test_every_measure_has_the_slope_that_differences_have(asked):
         assert judged.slope[i] == pytest.approx((costs[0] - costs[1]) / (2 * e), rel=1e-6)
 
 
-def test_the_optimum_is_that_of_a_grid_and_limits_hold(asked):
+def test_the_optimum_is_that_of_a_grid_and_limits_hold(tmp_path):
     problem = replace(
         ASKED,
         objective=(
@@ -99,7 +99,11 @@ def test_the_optimum_is_that_of_a_grid_and_limits_hold(asked):
         constraints=(Limit(measure="maximum", channel="q", at_most=0.75),),
     )
     own = task(problem, starts=2, pareto=3)
+    journal = tmp_path / "whole.jsonl"
+    journal.write_text("{}\n")
+    own.evaluator.keep(journal)
     found = own.tune()
+    lines = journal.read_text().splitlines(keepends=True)
     assert found.status is package.TuneStatus.SOLVED, found.summary()
     assert found.violation <= 1e-4
     search = own.search(own.evaluator(own.tuned.start))
@@ -113,6 +117,16 @@ def test_the_optimum_is_that_of_a_grid_and_limits_hold(asked):
     assert found.objective < found.before_objective or found.values == dict(found.before)
     first, second = np.array([p.measures for p in found.front]).T
     assert (np.diff(first[np.argsort(second)]) <= 1e-9).all()
+    # Ended on the way, it goes on and ends where it would have.
+    for share in (0.5, 0.9):
+        part = tmp_path / f"{share}.jsonl"
+        part.write_text("".join(lines[: int(share * len(lines))]))
+        again = task(problem, starts=2, pareto=3)
+        again.evaluator.keep(part)
+        repeated = again.tune()
+        assert (repeated.starts, repeated.front) == (found.starts, found.front)
+        assert repeated.values == found.values
+        assert repeated.evaluations == found.evaluations - int(share * len(lines)) + 1
     impossible = replace(problem, constraints=(Limit(measure="std", channel="q", at_most=1e-3),))
     lost = task(impossible, iterations=3).tune()
     assert lost.status is package.TuneStatus.INFEASIBLE

@@ -39,9 +39,8 @@ def loaded(config: LoopsConfig, folder: Path) -> Loaded:
     model = load(folder / config.model)
     named = [config.runs] if isinstance(config.runs, str) else config.runs
     runs = read_all(named, folder)
-    controller = controller_of(
-        str(folder / config.controller), None, config.interval or runs[0].time_step
-    )
+    interval = runs[0].time_step if config.interval is None else config.interval
+    controller = controller_of(str(folder / config.controller), None, interval)
     python = config.controller.rpartition(":")[0].endswith(".py")
     own = isinstance(controller, ROSCO) and not python
     deck = read_discon(folder / config.controller) if own else None

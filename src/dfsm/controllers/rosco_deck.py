@@ -144,6 +144,11 @@ def deck_parameters(discon: Discon) -> dict[str, jax.Array]:
                     f"{printable(str(discon.path))}: {key} does not rise from value to value: "
                     "sort it, or leave out what stands twice"
                 )
+            if (bad := ~np.isfinite(values)).any():
+                raise DfsmError(
+                    f"{printable(str(discon.path))}: {key} holds {values[bad][0]}, expected "
+                    "finite numbers: correct it"
+                )
             found[key] = jnp.asarray(values if key in _TABLES else values[0])
     return found
 

@@ -255,7 +255,7 @@ def existing_file(path: str | Path) -> Path:
 
 def _siblings(path: Path) -> str:
     try:
-        files = sorted(p.name for p in path.parent.iterdir() if p.is_file())
+        files = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p.name[0] != ".")
     except OSError:
         return f"its folder {path.parent} does not exist either: check the path"
     return f"in {path.parent}, {near_matches(path.name, files)}"

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +134,7 @@ class Evaluator:
             lines = journal.read_text(encoding="utf-8").splitlines()[1:]
             for line in lines:
                 if (found := _from_line(line)) is not None:
-                    self._known[tuple(found.theta.tolist())] = found
+                    self._know(found)
         self._journal = journal
 
     def __call__(self, theta: Array, slopes: bool = False) -> Figured:
@@ -157,11 +157,24 @@ class Evaluator:
             np.stack([d[1] for d in done], axis=1) if slopes else None,
             tuple(d[2] for d in done if d[2]),
         )
-        self._known[key] = found
+        self._know(found)
+        found = self._known[key]
         if self._journal is not None:
             with self._journal.open("a", encoding="utf-8") as stream:
                 stream.write(_line(found))
         return found
+
+    def _know(self, found: Figured) -> None:
+        """Remember figures; the first of a point stay, to which slopes come later.
+
+        With slopes the loop is another program, whose last digit may differ: a search that goes on
+        must see what it saw before.
+        """
+        key = tuple(found.theta.tolist())
+        before = self._known.get(key)
+        if before is not None and before.stable and found.stable:
+            found = replace(found, figures=before.figures)
+        self._known[key] = found
 
     def loops(self, theta: Array) -> list[ClosedLoopRun]:
         """The closed loops themselves at a point."""

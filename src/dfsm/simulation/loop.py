@@ -7,7 +7,8 @@ call by call.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from dfsm.controllers.controller import Controller
 from dfsm.core.types import Array
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, printable
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.integrate import observe, stepped
 from dfsm.simulation.wires import Wires
@@ -122,7 +123,8 @@ class March:
         """What the first call starts from: states, azimuth, controls set, controller's state."""
         wires, drive, v = self.wires, self.drive, self.drive.inputs
         seen = wires.measured(self.model, drive.x0, v[0], (drive.psi0, drive.field[0]))
-        begun = _plain(controller.start(seen, wires.commands_of(v[0])))
+        with _failing("start"):
+            begun = _plain(controller.start(seen, wires.commands_of(v[0])))
         return (drive.x0, drive.psi0, v[0, jnp.array(wires.commanded)], begun)
 
     def call(self, controller: Any, carry: Any, leg: Any) -> tuple[Any, Any]:
@@ -131,7 +133,8 @@ class March:
         x, psi, held, state = carry
         time, h, legs, field = leg
         seen = wires.measured(model, x, wires.with_commands(legs[0][0], held), (psi, field))
-        new, commands = controller.step(state, seen, time)
+        with _failing("step"):
+            new, commands = controller.step(state, seen, time)
         state, commands = _like(new, state), wires.in_model_units(_checked(commands, wires))
         path = []
         for step in range(self.per_call):
@@ -182,14 +185,31 @@ def _like(new: Any, old: Any) -> Any:
     )
 
 
-def _checked(commands: Any, wires: Wires) -> jax.Array:
-    commands = jnp.asarray(commands, dtype=float)
+@contextmanager
+def _failing(what: str) -> Iterator[None]:
+    """Tell that a controller's own code fails, which is no bug of this package."""
+    try:
+        yield
+    except DfsmError:
+        raise
+    except Exception as error:
+        first = str(error).partition("\n")[0]
+        raise DfsmError(
+            f"the controller's {what} fails with {type(error).__name__}: {printable(first)}"
+        ) from error
+
+
+def _of_right_shape(commands: Any, wires: Wires) -> Any:
     if commands.shape != (len(wires.commanded),):
         raise DfsmError(
             f"the controller's step returns commands of shape {commands.shape}, expected "
             f"({len(wires.commanded)},): one number per command"
         )
     return commands
+
+
+def _checked(commands: Any, wires: Wires) -> jax.Array:
+    return _of_right_shape(jnp.asarray(commands, dtype=float), wires)
 
 
 @eqx.filter_jit
@@ -274,16 +294,19 @@ class HostLoop:
         read = np.full((calls, len(wires.sources)), np.nan)
         states[0], psi = drive.x0, drive.psi0
         seen = np.asarray(self._seen(states[0], v[0], (psi, field[0])))
-        state = controller.start(seen, np.asarray(wires.commands_of(jnp.asarray(v[0]))))
+        with _failing("start"):
+            state = controller.start(seen, np.asarray(wires.commands_of(jnp.asarray(v[0]))))
         try:
             for k, (time, h) in enumerate(zip(drive.time, drive.h, strict=True)):
                 row = k * per_call
                 read[k] = seen
                 if stop(states[row]):
                     break
-                state, told = controller.step(state, seen, time)
+                with _failing(f"step at {time:g} s"):
+                    state, told = controller.step(state, seen, time)
+                    told = np.asarray(told, dtype=float)
                 rows = slice(row, row + per_call)
-                commands[rows] = told = np.asarray(told, dtype=float)
+                commands[rows] = told = _of_right_shape(told, wires)
                 if not np.isfinite(told).all():
                     break
                 until = row + per_call
