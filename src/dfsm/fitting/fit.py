@@ -40,6 +40,7 @@ from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
 from dfsm.fitting.samples import Samples, extract, select
+from dfsm.fitting.schedule_gaps import schedule_gaps
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.stabilize import stabilise
 from dfsm.models.corrective import Corrective
@@ -187,7 +188,8 @@ def fit(
         notes += more
         if hidden is None and refinement is None:
             notes += hidden_advice(e.decisions, data, settings, doubt)
-    known = (*f.warnings, *(g.warnings if g else ()), *doubt.notes, *notes)
+    gaps = schedule_gaps(samples, f.model)
+    known = (*f.warnings, *gaps, *(g.warnings if g else ()), *doubt.notes, *notes)
     notes = list(dict.fromkeys(known))
     checks = [*_inputs_told(samples, settings), *f.notes, *learned, *checks]
     nonlinear = None
