@@ -14,6 +14,8 @@ from conftest import files_of
 from dfsm.core.bundle import checksum
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
+from dfsm.models.model_folder import load
+from dfsm.simulation.simulate import simulate
 from dfsm.validation.intervals import load_intervals
 from systems import DUFFING
 
@@ -65,8 +67,11 @@ def test_simulate_writes_the_ends_too(here, dfsm, fitted, fresh, intervals):
     assert (shown.code, shown.err) == (0, "")
     written, plain = read("o.csv"), ("q", "q_dot", "y", "z")
     assert written.names == (*plain, *(f"{n}_{end}" for n in plain for end in ("low", "high")))
-    half = load_intervals(intervals).half_width[0]
-    for name, width in zip(plain, half, strict=True):
+    found, begin = load_intervals(intervals), float(written.time[0])
+    rollout = simulate(load(fitted), read(new), start=begin)
+    factor = found.growth.factor(written.time - begin, rollout.distance)
+    assert (factor[0] < factor[-1]).all()
+    for name, width in zip(plain, (found.half_width[0] * factor).T, strict=True):
         np.testing.assert_allclose(written[name] - written[f"{name}_low"], width, rtol=1e-6)
         np.testing.assert_allclose(written[f"{name}_high"] - written[name], width, rtol=1e-6)
 

@@ -34,8 +34,13 @@ def optimize(
     if as_json:
         from dfsm.core.files import json_value
 
-        told = {"ending": solution.ending.name.lower(), "message": solution.message}
-        print_json(json_value(told | {"objective": solution.objective} | article.to_dict()))
+        told: dict[str, object] = {
+            "ending": solution.ending.name.lower(),
+            "message": solution.message,
+        }
+        told |= {"objective": solution.objective, "outside": solution.outside}
+        told |= {"departures": list(solution.departures)}
+        print_json(json_value(told | article.to_dict()))
     elif not quiet:
         from dfsm.cli.tables import print_article
 

@@ -23,6 +23,8 @@ from dfsm.control.solution import HELD, RATE, Ending, Solution
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError
+from dfsm.models.departures import departures, told
+from dfsm.models.inputs import GROUPS
 
 _ENDINGS = {
     "solved": Ending.SOLVED,
@@ -85,6 +87,7 @@ def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) 
         linear_quadratic=program.linear_quadratic,
         violation=worst_violation(program, z),
         outside=_outside(problem, trajectories),
+        departures=_departures(problem, trajectories),
         replays=replays,
         bounds=_bounds(shot, trajectories[0].time),
         solver_state=outcome.multipliers,
@@ -214,12 +217,29 @@ def _outside(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> floa
     region = problem.plant.region
     if region is None:
         return None
-    shares = []
-    for run in runs:
-        outside = np.asarray(region.outside(inputs_of(problem, run)), dtype=float)
-        # Each sample stands for half of the steps beside it.
-        shares.append(np.trapezoid(outside, run.time) / run.duration)
+    shares = [_weights(run) @ np.asarray(region.outside(inputs_of(problem, run))) for run in runs]
     return float(np.mean(shares))
+
+
+def _departures(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> tuple[str, ...]:
+    """Per scenario that leaves the training range, where it does."""
+    plant, sentences = problem.plant, []
+    if plant.region is None:
+        return ()
+    channels = [c for group in GROUPS for c in plant.channels[group]]
+    for run in runs:
+        inputs = inputs_of(problem, run)
+        outside = np.asarray(plant.region.outside(inputs))
+        found = departures(plant.region, channels, run.time, inputs, outside, _weights(run))
+        if found:
+            sentences.append(f"{run.name}: {told(found)}" if runs[1:] else told(found))
+    return tuple(sentences)
+
+
+def _weights(run: Trajectory) -> Array:
+    """Share of the horizon that every node stands for: half of the steps beside it."""
+    steps = np.diff(run.time)
+    return (np.r_[steps, 0] + np.r_[0, steps]) / (2 * run.duration)
 
 
 def inputs_of(problem: OptimalControlProblem, run: Trajectory) -> Array:

@@ -172,6 +172,8 @@ class Solution(Drawn):
         Largest violation of a constraint at the nodes, relative to its size.
     outside
         Share of the horizon with any input outside the training range; None without a surrogate.
+    departures
+        Per scenario that leaves it, which signals do, how far, when first and how long.
     replays
         Per scenario, see `Replay`; empty where it was not asked for.
     bounds
@@ -215,6 +217,7 @@ class Solution(Drawn):
     solver_state: Array = field(default_factory=lambda: np.empty(0))
     optimality: Optimality | None = None
     errors: Mapping[str, float] = field(default_factory=dict)
+    departures: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         t = self.trajectory
@@ -324,9 +327,24 @@ class Solution(Drawn):
             lines.append(
                 f"simulated{where}, the states differ by at most {_listed(replay.deviation)}"
             )
-        if self.outside is not None:
-            lines.append(f"{self.outside:.1%} of the horizon outside the training range")
+        lines += self.outside_told()
         return "\n".join(lines)
+
+    def outside_told(self) -> list[str]:
+        """How long the optimum is outside the training range, and where; empty without a surrogate.
+
+        Outside, the model may promise what the system does not do.
+        """
+        if self.outside is None:
+            return []
+        lines = [f"{self.outside:.1%} of the horizon outside the training range"]
+        if self.departures:
+            lines += [f"  {text}" for text in self.departures]
+            lines.append(
+                "  there the model may promise what the system does not do; stay_inside keeps "
+                "controls and states near the training data"
+            )
+        return lines
 
     def _between(self) -> list[str]:
         """What is known of the errors between the nodes."""

@@ -81,6 +81,8 @@ def save_solution(
         "replays": _apart("replays", [r.trajectory for r in solution.replays], tensors),
         "deviations": [[dict(r.deviation), r.relative] for r in solution.replays],
     }
+    if solution.departures:
+        content["departures"] = list(solution.departures)
     if solution.errors:
         content["errors"] = dict(solution.errors)
     if solution.optimality is not None:
@@ -134,6 +136,7 @@ def load_solution(path: str | Path) -> Solution:
             solver_state=tensors["solver_state"],
             optimality=_optimality(manifest),
             errors=_numbers(manifest.get("errors", {})),
+            departures=TypeAdapter(tuple[str, ...]).validate_python(manifest.get("departures", ())),
         )
         _check(solution)
     except (*_GARBLED, DfsmError) as error:

@@ -191,6 +191,7 @@ def _limits(
     time, pitch, torque = (rows.get(k) for k in ("time", "pitch", "torque"))
     assert time is not None
     lines, notes = {}, [CUTS]
+    notes += [f"outside the model's training range: {text}" for text in solution.departures]
     if pitch is not None:
         lines["PC_ControlMode"] = "1"
         actuator = [c.name for c in solution.trajectory.channels if _is_actuator(c)]

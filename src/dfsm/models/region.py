@@ -74,8 +74,13 @@ class Region(eqx.Module):
 
     @eqx.filter_jit
     def _outside(self, inputs: jax.Array) -> jax.Array:
+        return self.judged(inputs)[0]
+
+    def judged(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """What `outside` and `distance` say of ``(..., input)``, for compiled code."""
+        distance = self.distance(inputs)
         # An optimum that is kept inside meets the limit to a solver's tolerance.
-        return jnp.any(self.beyond(inputs), axis=-1) | (self.distance(inputs) > 1 + 1e-6)
+        return jnp.any(self.beyond(inputs), axis=-1) | (distance > 1 + 1e-6), distance
 
     def beyond(self, inputs: ArrayLike) -> jax.Array:
         """Tell which of ``(..., input)`` are outside their own training range."""

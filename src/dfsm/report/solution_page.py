@@ -91,6 +91,7 @@ def outcome(s: Solution) -> Table:
     ]
     if s.outside is not None:
         rows.append(("outside the training range (% of the horizon)", 100 * s.outside))
+        rows += [("outside the training range", text) for text in s.departures]
     return Table("outcome", "How the solve ended", ("what", "value"), tuple(rows), digits=6)
 
 

@@ -26,6 +26,7 @@ from dfsm.controllers.controller import Controller
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
+from dfsm.models.departures import Departure, departures, told
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_compiled
@@ -69,6 +70,8 @@ class ClosedLoopRun(DrawnRun):
     outside
         Share of the samples with any input of the model outside its training range; not a number
         where nobody asked.
+    departures
+        Where it left the training range, those that lasted longest first.
     wall_time
         Seconds it took (of the whole batch divided by its runs), without compilation when warm.
     """
@@ -79,6 +82,7 @@ class ClosedLoopRun(DrawnRun):
     reason: str
     outside: float
     wall_time: float = 0.0
+    departures: tuple[Departure, ...] = ()
 
     def __repr__(self) -> str:
         run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
@@ -91,7 +95,8 @@ class ClosedLoopRun(DrawnRun):
     def message(self) -> str:
         """One sentence on the outcome."""
         if self.status is LoopStatus.COMPLETED:
-            return f"{self.outside:.1%} of the time outside the training range"
+            where = f": {told(self.departures)}" if self.departures else ""
+            return f"{self.outside:.1%} of the time outside the training range{where}"
         return f"{self.reason}; {self.status.value}"
 
 
@@ -328,7 +333,17 @@ def result_of(
     outside = np.full(len(values), np.nan)
     if path.outside is not None:
         outside = case.sampled(np.asarray(path.outside)[:steps, None].astype(float))[:, 0]
-    return _cut(case, (values, outside), channels, (status, reason, time[min(end, steps - 1)]))
+    result = _cut(case, (values, outside), channels, (status, reason, time[min(end, steps - 1)]))
+    if not (result.outside > 0 and status is LoopStatus.COMPLETED):
+        return result
+    exogenous = jnp.asarray(np.asarray(case.drive.inputs)[::2][:steps])
+    _, w, p = s.order.split_exogenous(exogenous)
+    inputs = case.sampled(np.asarray(model.join(states, controls, w, p)))
+    kept = slice(len(inputs) - len(result.trajectory), None)
+    found = departures(
+        model.region, s.inputs, result.trajectory.time, inputs[kept], outside[kept] > 0
+    )
+    return replace(result, departures=found)
 
 
 def _failure(controller: Controller, path: Path, commanded: Array, at: tuple[int, float]) -> str:
@@ -372,7 +387,7 @@ def _warn(results: Sequence[ClosedLoopRun]) -> None:
         warnings.warn(
             f"{len(outside)} of {len(results)} closed loops spend more than {MUCH_OUTSIDE:.0%} of "
             f"the time outside the training range, {worst.trajectory.name} most "
-            f"({worst.outside:.1%})",
+            f"({worst.outside:.1%}): {told(worst.departures)}",
             DfsmWarning,
             stacklevel=3,
         )

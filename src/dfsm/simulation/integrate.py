@@ -123,6 +123,8 @@ class Rollout:
         Shapes ``(sample, state)`` and ``(sample, output)``.
     outside
         Whether any input is outside its training range, ``(sample,)``.
+    distance
+        Squared distance from the training data, ``(sample,)``, see `Region.distance`.
     solved
         Whether the solver reached the end.
     """
@@ -130,6 +132,7 @@ class Rollout:
     states: Array
     outputs: Array
     outside: Array
+    distance: Array
     solved: bool
 
 
@@ -274,8 +277,8 @@ def observe(
     xs: jax.Array,
     drive: tuple[jax.Array, jax.Array],
     psi0: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Outputs along rollouts ``(..., time, n)``, and whether any input is outside its range.
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Outputs along rollouts ``(..., time, n)``, what is outside the training range, distances.
 
     `drive` are the exogenous inputs and the wind field. The azimuth is the integral of the
     rollout's own speed.
@@ -290,13 +293,14 @@ def observe(
 
 def seen(
     model: DFSM, xs: jax.Array, inputs: jax.Array, field: jax.Array, psi: jax.Array | None
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Outputs ``(..., output)`` at states, exogenous inputs, wind field and azimuth ``(...)``.
 
-    And whether any input is outside its range, ``(...)``.
+    And whether the training range is left there, and the squared distance from the training data,
+    both ``(...)``.
     """
     groups = model.signals.order.split_exogenous(inputs)
-    return model.output(xs, *groups, psi, field), model.region.outside(model.join(xs, *groups))
+    return model.output(xs, *groups, psi, field), *model.region.judged(model.join(xs, *groups))
 
 
 # -- adaptive steps -----------------------------------------------------------------------------
@@ -325,16 +329,16 @@ def adapt(model: DFSM, case: Case[Pieces], method: str, tolerances: tuple[float,
     bends[:, : len(drive.bends)] = drive.bends, drive.after
     # Tolerances as arrays: a Python number would be compiled in, and another compile again.
     start = (case.x0, case.psi0, case.field)
-    path = (drive.time, drive.values, drive.starts, drive.coefficients)
-    states, outputs, outside, solved = _adapt(
+    driven = (drive.time, drive.values, drive.starts, drive.coefficients)
+    *path, solved = _adapt(
         model,
-        tuple(map(jnp.asarray, path)),
+        tuple(map(jnp.asarray, driven)),
         tuple(map(jnp.asarray, bends)),
         tuple(map(jnp.asarray, tolerances)),
         start=tuple(map(jnp.asarray, start)),
         method=method,
     )
-    return Rollout(np.asarray(states), np.asarray(outputs), np.asarray(outside), bool(solved))
+    return Rollout(*map(np.asarray, path), solved=bool(solved))
 
 
 @eqx.filter_jit
@@ -346,7 +350,7 @@ def _adapt(
     *,
     start: tuple[jax.Array, ...],
     method: str,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+) -> tuple[jax.Array, ...]:
     import diffrax
 
     from dfsm.simulation.bends import EndingAtBends
@@ -382,5 +386,5 @@ def _adapt(
         throw=False,
     )
     states = jnp.asarray(solution.ys) * spread
-    outputs, outside = observe(model, jnp.diff(samples), states, (values, field), psi0)
-    return states, outputs, outside, solution.result == diffrax.RESULTS.successful
+    seen = observe(model, jnp.diff(samples), states, (values, field), psi0)
+    return states, *seen, solution.result == diffrax.RESULTS.successful

@@ -153,7 +153,7 @@ class March:
             drive.inputs[::2], jnp.concatenate([commands, commands[-1:]])
         )
         h = jnp.repeat(drive.h, self.per_call)
-        outputs, outside = observe(model, h, states, (inputs, drive.field), drive.psi0)
+        outputs, outside, _ = observe(model, h, states, (inputs, drive.field), drive.psi0)
         return Path(states, inputs[:, : len(model.signals.controls)], outputs, outside, seen)
 
 
@@ -321,7 +321,7 @@ class HostLoop:
             jnp.asarray(v[::2]), wires.in_model_units(jnp.asarray(commands))
         )
         h = jnp.repeat(jnp.asarray(drive.h), per_call)
-        outputs, outside = self._observed(
+        outputs, outside, _ = self._observed(
             self.model, h, jnp.asarray(states), (inputs, drive.field), jnp.asarray(drive.psi0)
         )
         count = len(self.model.signals.controls)

@@ -126,18 +126,17 @@ def _device() -> Any:
     return jax.devices(chosen)[0] if chosen is None or isinstance(chosen, str) else chosen
 
 
-_Results = tuple[Array, Array, Array]
+_Results = tuple[Array, ...]
 _Sent = tuple[jax.Array, ...] | Exception
 
 
 def _one(model: DFSM, case: Case[Mesh]) -> Rollout:
     results = _march_batch(model, [case])
-    return _rollout(tuple(map(np.asarray, results)), case.drive, 0)  # pyright: ignore[reportArgumentType]
+    return _rollout(tuple(map(np.asarray, results)), case.drive, 0)
 
 
 def _rollout(results: _Results, mesh: Mesh, run: int) -> Rollout:
-    states, outputs, outside = (part[run, : len(mesh.time)] for part in results)
-    return Rollout(states, outputs, outside, True)
+    return Rollout(*(part[run, : len(mesh.time)] for part in results), solved=True)
 
 
 def _ahead(
@@ -198,7 +197,7 @@ def _batches(model: DFSM, meshes: Sequence[Mesh]) -> Iterator[list[int]]:
         rows.sort(key=lambda i: (len(meshes[i].time), i))
         longest = meshes[rows[-1]]
         splines = 3 * len(_kind(longest).splines)
-        wide = 2 + len(s.exogenous) + splines + len(s.states) + len(s.outputs) + len(s.field)
+        wide = 3 + len(s.exogenous) + splines + len(s.states) + len(s.outputs) + len(s.field)
         each = 8 * _COPIES * wide * padded(len(longest.time), _FEWEST_SAMPLES)
         most = min(_MOST_RUNS, max(1, int(_SHARE * _free_memory()) // each))
         parts = -(-len(rows) // most)
@@ -228,7 +227,7 @@ def _kind(mesh: Mesh) -> _Kind:
 def _march_batch(
     model: DFSM, cases: Sequence[Case[Mesh]], pool: ThreadPoolExecutor | None = None
 ) -> tuple[jax.Array, ...]:
-    """States, outputs and what is outside, ``(run, sample, ...)``, padded; under way only."""
+    """States, outputs, what is outside and how far, ``(run, sample, ...)``, padded."""
     longest = max(len(c.drive.time) for c in cases)
     samples, runs = padded(longest, _FEWEST_SAMPLES), padded(len(cases))
     kind, x0 = _kind(cases[0].drive), cases[0].x0
@@ -331,21 +330,20 @@ def _along(
     paths: tuple[jax.Array, jax.Array, jax.Array, jax.Array | None],
     count: int | IntArray,
     rows: int,
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, ...]:
     """Outputs and the region's check along paths ``(sample, run, ...)``, `rows` samples at once."""
     see = jax.vmap(jax.vmap(partial(seen, model)))
     places = paths[0].shape[:2]
     outputs = jnp.zeros((*places, len(model.signals.outputs)))
 
-    def on(k: jax.Array, found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def on(k: jax.Array, found: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         # The last part begins earlier than its place and does some samples again.
         first = jnp.minimum(k * rows, places[0] - rows)
         part = [None if p is None else jax.lax.dynamic_slice_in_dim(p, first, rows) for p in paths]
-        outputs, outside = (
+        return tuple(
             jax.lax.dynamic_update_slice_in_dim(whole, new, first, 0)
             for whole, new in zip(found, see(*part), strict=True)  # pyright: ignore[reportArgumentType]
         )
-        return outputs, outside
 
-    found = outputs, jnp.zeros(places, dtype=bool)
+    found = outputs, jnp.zeros(places, dtype=bool), jnp.zeros(places)
     return jax.lax.fori_loop(0, (count + rows) // rows, on, found)

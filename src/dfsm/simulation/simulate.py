@@ -5,9 +5,7 @@ A rollout is driven by controls, disturbances, parameters and the initial state,
 
 from __future__ import annotations
 
-import enum
 import time as clock
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args, overload
@@ -21,29 +19,30 @@ from dfsm.core.types import Array
 from dfsm.data.between import Chosen
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
-from dfsm.errors import DfsmError, DfsmWarning, printable
+from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed, completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import require_constant, require_field
-from dfsm.numerics.time_mesh import mean_over, weights_over_time
-from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.fastest import REACH, fastest_rates
 from dfsm.simulation.hidden import latents_from_past, told_state
-from dfsm.simulation.integrate import (
-    Case,
-    Drive,
-    Rollout,
-    adapt,
-    mesh_of,
-    pieces_of,
-)
+from dfsm.simulation.integrate import Case, Drive, Rollout, adapt, mesh_of, pieces_of
 from dfsm.simulation.march import march
+from dfsm.simulation.outcome import ESCAPE, MUCH_OUTSIDE, Simulation, Status, judge, tell
 
-# A rollout ends where a state is this many times its training half-range from the middle.
-ESCAPE = 10.0
-# Share of the time outside the training range above which a user is warned.
-MUCH_OUTSIDE = 0.05
+__all__ = [
+    "ESCAPE",
+    "METHODS",
+    "MUCH_OUTSIDE",
+    "Method",
+    "Simulation",
+    "SimulationSettings",
+    "Status",
+    "initial_azimuth",
+    "initial_state",
+    "simulate",
+]
+
 # Rates at the start are taken from this much of the record before it (or, where the record starts
 # there, just after it): long enough for a derivative, too short to leak a response.
 _HISTORY = 5.0
@@ -87,69 +86,6 @@ class SimulationSettings:
     def __post_init__(self) -> None:
         if self.step is not None and not self.step > 0:
             raise DfsmError(f"the simulation step is {self.step} s, expected more than 0")
-
-
-class Status(enum.Enum):
-    """How a simulation ended; the value says what it means and what to do."""
-
-    COMPLETED = "completed"
-    LEFT_REGION = (
-        "stopped where a state left the training range by a factor of ten: the model is unstable "
-        "there; look at its eigenvalues, or train on runs that cover this case"
-    )
-    NOT_FINITE = (
-        "stopped where a state was no longer finite: use a smaller step or a stiff method, and "
-        "look at the model's eigenvalues"
-    )
-    SOLVER_FAILED = (
-        "the adaptive solver gave up: loosen rtol and atol, use kvaerno5 for a stiff model, or rk4"
-    )
-
-
-@dataclass(frozen=True)
-class Simulation(DrawnRun):
-    """A rollout.
-
-    Attributes
-    ----------
-    trajectory
-        States and outputs on the run's time mesh, up to where the rollout ended; roles are set.
-    status
-        How it ended.
-    ended
-        Last time in s.
-    reason
-        For a rollout that did not complete, the state that left the range and where; else "".
-    outside
-        Share of the time with any input outside its training range.
-    wall_time
-        Seconds it took (of the whole batch divided by its runs), without compilation when warm.
-    note
-        What was done otherwise than asked for: shorter steps, or another method; else "".
-    """
-
-    trajectory: Trajectory
-    status: Status
-    ended: float
-    reason: str
-    outside: float
-    wall_time: float = 0.0
-    note: str = ""
-
-    def __repr__(self) -> str:
-        run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
-        return (
-            f"<Simulation of {printable(run.name)}: {outcome}, {run.time[0]:g} to "
-            f"{self.ended:g} s, {len(run)} samples; {printable(self.message)}>"
-        )
-
-    @property
-    def message(self) -> str:
-        """One sentence on the outcome."""
-        more = f"; {self.note}" if self.note else ""
-        if self.status is Status.COMPLETED:
-            return f"{self.outside:.1%} of the time outside the training range{more}"
-        return f"{self.reason}; {self.status.value}{more}"
 
 
 @overload
@@ -247,7 +183,7 @@ def simulate(
         return Case(drive, x0, initial_azimuth(model, batch[i], begins), fields[i].values)
 
     def judged(i: int, rollout: Rollout) -> Simulation:
-        result = _result(model, batch[i], driven[i], rollout)
+        result = judge(model, batch[i], driven[i], rollout)
         return replace(result, note=steps[i].note)
 
     begin = clock.perf_counter()
@@ -270,7 +206,7 @@ def simulate(
     results = [found[i] if i in found else adapted(i) for i in range(len(batch))]
     wall = (clock.perf_counter() - begin) / len(batch)
     results = [replace(r, wall_time=wall) for r in results]
-    _warn(results)
+    tell(results)
     return results[0] if single else results
 
 
@@ -386,65 +322,3 @@ def initial_azimuth(model: DFSM, run: Trajectory, start: float) -> float:
     if azimuth is None or azimuth.angle is None or azimuth.angle not in run:
         return 0.0
     return float(np.deg2rad(run[azimuth.angle][int(np.argmin(np.abs(run.time - start)))]))
-
-
-# -- judging the outcome ------------------------------------------------------------------------
-
-
-def _result(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) -> Simulation:
-    s = model.signals
-    columns = s.state_columns
-    low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
-    middle, half = (low + high) / 2, (high - low) / 2
-    x = rollout.states
-    finite = np.isfinite(x)
-    escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > ESCAPE * half)
-    rows = np.flatnonzero(escaped.any(axis=1))
-    end = int(rows[0]) if len(rows) else len(x)
-    status, reason = Status.COMPLETED, ""
-    # An adaptive solver that gives up leaves the samples beyond without a value.
-    if not rollout.solved and (end == len(x) or not finite[end].all()):
-        status, reason = Status.SOLVER_FAILED, f"no solution beyond {driven.time[end - 1]:g} s"
-    elif len(rows):
-        column = int(np.flatnonzero(escaped[end])[0])
-        status = Status.LEFT_REGION if finite[end].all() else Status.NOT_FINITE
-        reason = (
-            f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
-            f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
-        )
-        # The sample where it left shows which way the model went.
-        end += status is Status.LEFT_REGION
-    values = np.concatenate([x, rollout.outputs], axis=1)[: max(2, end)]
-    values[end:] = np.nan  # a trajectory has two samples, even if the first step failed
-    channels = (*s.states, *s.outputs)
-    time = driven.time[: len(values)]
-    return Simulation(
-        trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
-        status=status,
-        ended=float(time[end - 1]),
-        reason=reason,
-        outside=float(mean_over(rollout.outside[:end], _weights(driven.time[:end]))),
-    )
-
-
-def _weights(time: Array) -> Array | None:
-    return None if len(time) < 2 else weights_over_time([time])
-
-
-def _warn(results: Sequence[Simulation]) -> None:
-    ended = [r for r in results if r.status is not Status.COMPLETED]
-    for r in ended:
-        warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=3)
-    cut = [r for r in results if r.note and r.status is Status.COMPLETED]
-    if cut:
-        more = f" ({len(cut)} of the {len(results)} rollouts alike)" if len(cut) > 1 else ""
-        warnings.warn(f"{cut[0].trajectory.name}: {cut[0].note}{more}", DfsmWarning, stacklevel=3)
-    outside = [r for r in results if r.status is Status.COMPLETED and r.outside > MUCH_OUTSIDE]
-    if outside:
-        worst = max(outside, key=lambda r: r.outside)
-        warnings.warn(
-            f"{len(outside)} of {len(results)} rollouts spend more than {MUCH_OUTSIDE:.0%} of the "
-            f"time outside the training range, {worst.trajectory.name} most ({worst.outside:.1%})",
-            DfsmWarning,
-            stacklevel=3,
-        )

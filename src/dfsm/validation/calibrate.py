@@ -1,9 +1,10 @@
 """Prediction intervals calibrated on runs that the model never saw.
 
-At every operating point half-widths are a multiple of the root mean square error there; the
-multiple is the quantile of the errors of each calibration run relative to what the other runs
-give, so that no run is judged by a scale that it set itself (conformal prediction with one run
-left out; Barber et al. 2021).
+A law tells the root mean square error that is to be expected at an operating point, so long after
+the start and so far from the training data (`growth`). Half-widths are a multiple of it: the
+quantile of the errors of each group of runs relative to what the law of the others expects, so that
+no run is judged by a law that it made (conformal prediction with groups left out; Barber et al.
+2021).
 """
 
 from __future__ import annotations
@@ -14,18 +15,21 @@ import numpy as np
 
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import require
-from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
-from dfsm.simulation.simulate import SimulationSettings, Status
-from dfsm.validation.intervals import Intervals, interpolated, schedule_along
-from dfsm.validation.validate import listed, of_the_fit, validate
+from dfsm.simulation.simulate import SimulationSettings
+from dfsm.validation.growth import RolloutErrors, law_of
+from dfsm.validation.intervals import Intervals
+from dfsm.validation.rollout_errors import rollout_errors
+from dfsm.validation.validate import listed, of_the_fit
 
 # Calibration runs below which a quantile over runs means nothing.
 _FEWEST = 3
+# A law for each run left out takes long with many, and says the same.
+_MOST_GROUPS = 8
 
 
 @renamed(options="settings")
@@ -71,34 +75,56 @@ def calibrate(
             f"intervals are calibrated on at least {_FEWEST} runs, {len(runs)} were given"
         )
     Dataset(runs)  # refuses a run that occurs twice
-    validation = validate({"model": model}, runs, start=start, stop=stop, settings=settings)
-    errors, schedules = [], []
-    for run, compared in zip(runs, validation.runs, strict=True):
-        rollout = compared.models["model"].simulation
-        if rollout.status is not Status.COMPLETED:
-            raise DfsmError(f"{run.where}: {rollout.message}; no interval holds such a rollout")
-        names = [c.name for c in validation.channels]
-        truth = compared.recorded.select(names).values
-        errors.append(rollout.trajectory.select(names).values - truth)
-        schedules.append(schedule_along(model.schedule, run, rollout.trajectory))
-    grid = np.asarray(model.region.grid)
-    squares = [_sums(grid, at, e**2) for at, e in zip(schedules, errors, strict=True)]
+    groups = [f"{k % _MOST_GROUPS}" for k in range(len(runs))]
+    parts, ended = rollout_errors(model, runs, groups, start=start, stop=stop, settings=settings)
+    for rollout in ended:
+        where = next(r.where for r in runs if r.name == rollout.trajectory.name)
+        raise DfsmError(f"{where}: {rollout.message}; no interval holds such a rollout")
+    return intervals_of(model, parts, runs, level=level, warnings=_leaks(model, runs))
+
+
+def intervals_of(
+    model: DFSM,
+    parts: Sequence[RolloutErrors],
+    runs: Sequence[Trajectory],
+    *,
+    level: float,
+    warnings: Sequence[str] = (),
+) -> Intervals:
+    """Intervals of a model from rollouts over runs that were left out.
+
+    Parameters
+    ----------
+    model
+        The surrogate, or one of several that were trained without some of the runs.
+    parts
+        Errors of rollouts, in at least two groups.
+    runs
+        That they are of, in the model's units.
+    level
+        Share of the time.
+    warnings
+        What a reader should know.
+    """
+    s, grid = model.signals, np.asarray(model.region.grid)
     scores = []
-    for k, (at, e) in enumerate(zip(schedules, errors, strict=True)):
-        scale = _scale([q for j, q in enumerate(squares) if j != k])
-        scores.append(np.abs(e) / interpolated(grid, scale, at))
-    multiple = np.quantile(np.concatenate(scores), level, axis=0)
+    for group in dict.fromkeys(part.group for part in parts):
+        law = law_of([p for p in parts if p.group != group], grid)
+        scores += [np.abs(p.errors) / law.at(p) for p in parts if p.group == group]
+    law = law_of(parts, grid)
+    channels = (*s.observed, *s.outputs)
     return Intervals(
-        channels=tuple(c.name for c in validation.channels),
-        units=tuple(c.unit for c in validation.channels),
+        channels=tuple(c.name for c in channels),
+        units=tuple(c.unit for c in channels),
         schedule=model.schedule,
         grid=grid,
-        half_width=multiple * _scale(squares),
+        half_width=np.quantile(np.concatenate(scores), level, axis=0) * law.scale,
         level=level,
         runs=tuple(r.name for r in runs),
         digests=tuple(r.select(s.recorded).digest for r in runs),
-        warnings=tuple(_leaks(model, runs)),
+        warnings=tuple(warnings),
         schedule_unit=next((c.unit for c in s.inputs if c.name == model.schedule), ""),
+        growth=law.growth,
     )
 
 
@@ -111,19 +137,3 @@ def _leaks(model: DFSM, runs: Sequence[Trajectory]) -> list[str]:
         f"{len(fitted)} of the {len(runs)} calibration runs were used in training "
         f"({listed(fitted)}): new runs will lie inside less often than promised"
     ]
-
-
-def _sums(grid: Array, schedule: Array, squares: Array) -> tuple[Array, Array]:
-    """Weight ``(point,)`` and weighted sum of squared errors ``(point, channel)`` of one run."""
-    hats = np.stack([np.interp(schedule, grid, row) for row in np.eye(len(grid))])
-    return hats.sum(axis=1), hats @ squares
-
-
-def _scale(sums: Sequence[tuple[Array, Array]]) -> Array:
-    """Root mean square error at every point; that of all where no run has been."""
-    weight, total = (np.sum([s[k] for s in sums], axis=0) for k in (0, 1))
-    overall = total.sum(axis=0) / weight.sum()
-    # As good as a sample of the overall error: a point that was hardly visited leans on the rest.
-    spread = np.sqrt((total + overall) / (weight + 1)[:, None])
-    # A channel that is always zero has no error to be divided by.
-    return np.maximum(spread, np.finfo(float).tiny)

@@ -25,6 +25,7 @@ from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.simulate import Simulation
+from dfsm.validation.growth import Growth
 
 _FORMAT = 1
 _UNSIGNED = ("format", "dfsm", "level", "schedule", "grid", "channels", "runs", "warnings")
@@ -33,7 +34,7 @@ _AGAIN = "make it again with dfsm calibrate"
 
 @dataclass(frozen=True)
 class Intervals:
-    """Half-widths of prediction intervals along the schedule.
+    """Half-widths of prediction intervals: along the schedule, and how they grow.
 
     Attributes
     ----------
@@ -44,7 +45,8 @@ class Intervals:
     grid
         Schedule values, shape ``(point,)``; between them half-widths are interpolated.
     half_width
-        Shape ``(point, channel)``, in the channels' units.
+        Shape ``(point, channel)``, in the channels' units: after the longest rollout that was left
+        out, as far from the training data as is usual.
     level
         Share of the time that the record of a new run is expected inside.
     runs, digests
@@ -53,6 +55,9 @@ class Intervals:
         What a reader should know before trusting them.
     schedule_unit
         Unit of the schedule; none in files that say nothing of it.
+    growth
+        How half-widths depend on the time since the start and on the distance from the training
+        data; None where they do not, as in files of version 0.1.
     """
 
     channels: tuple[str, ...]
@@ -65,6 +70,7 @@ class Intervals:
     digests: tuple[str, ...]
     warnings: tuple[str, ...] = ()
     schedule_unit: str = ""
+    growth: Growth | None = None
 
     def check(self, model: DFSM) -> None:
         """Refuse to stand around rollouts of another model.
@@ -104,6 +110,8 @@ class Intervals:
             run = in_units_of(run, [Channel(self.schedule, self.schedule_unit)])
         middle = rollout.trajectory.select(self.channels)
         half = interpolated(self.grid, self.half_width, schedule_along(self.schedule, run, middle))
+        if self.growth is not None:
+            half = half * self.growth.factor(middle.time - middle.time[0], rollout.distance)
         low, high = (
             Trajectory(middle.time, middle.values + sign * half, middle.channels, name=run.name)
             for sign in (-1, 1)
@@ -151,6 +159,8 @@ class Intervals:
             "runs": [{"name": name, "sha256": digest} for name, digest in runs],
             "warnings": self.warnings,
         }
+        if self.growth is not None:
+            content["growth"] = {k: np.asarray(v).tolist() for k, v in vars(self.growth).items()}
         write_json(path, signed(content))
 
 
@@ -165,6 +175,14 @@ class _Run(BaseModel):
     sha256: str
 
 
+class _Growth(BaseModel):
+    lag: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2)]
+    along: list[list[Annotated[float, Field(ge=0, allow_inf_nan=False)]]]
+    power: list[Annotated[float, Field(ge=0, allow_inf_nan=False)]]
+    memory: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    farthest: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
 class _File(BaseModel):
     """What `Intervals.save` writes."""
 
@@ -175,6 +193,7 @@ class _File(BaseModel):
     channels: Annotated[list[_Channel], Field(min_length=1)]
     runs: list[_Run]
     warnings: list[str]
+    growth: _Growth | None = None
 
 
 def load_intervals(path: str | Path) -> Intervals:
@@ -226,7 +245,21 @@ def load_intervals(path: str | Path) -> Intervals:
         digests=tuple(r.sha256 for r in content.runs),
         warnings=tuple(content.warnings),
         schedule_unit=content.schedule_unit,
+        growth=_growth(path, content),
     )
+
+
+def _growth(path: Path, content: _File) -> Growth | None:
+    """How half-widths grow, of the shape that its channels ask for."""
+    told = content.growth
+    if told is None:
+        return None
+    shape = (len(told.lag), len(content.channels))
+    shaped = len(told.along) == shape[0] and {len(row) for row in told.along} == {shape[1]}
+    if not shaped or len(told.power) != shape[1] or not (np.diff(told.lag) > 0).all():
+        raise _foreign(path, "its growth is not that of its channels")
+    values = map(np.array, (told.lag, told.along, told.power))
+    return Growth(*values, told.memory, told.farthest)
 
 
 def _same_channels(ours: Sequence[Channel], theirs: Sequence[Channel]) -> bool:

@@ -13,6 +13,7 @@ from dfsm.core.files import json_value
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import printable
+from dfsm.models.departures import told
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.spectra import Spectrum
 from dfsm.numerics.time_mesh import mean_over, std_over
@@ -261,11 +262,13 @@ class Validation(DrawnByRun):
         """One sentence per model that spent much of its time outside the training range."""
         sentences = []
         for name in self.models:
-            shares = [r.models[name].simulation.outside for r in self.runs]
-            if max(shares) > MUCH_OUTSIDE:
+            worst = max(self.runs, key=lambda r: r.models[name].simulation.outside)
+            rollout = worst.models[name].simulation
+            if rollout.outside > MUCH_OUTSIDE:
+                where = f": {told(rollout.departures)}" if rollout.departures else ""
                 sentences.append(
-                    f"{name}: up to {max(shares):.0%} of a rollout has an input or state outside "
-                    "the training range"
+                    f"{name}: up to {rollout.outside:.0%} of a rollout has an input or state "
+                    f"outside the training range{where}"
                 )
         return sentences
 

@@ -1,0 +1,178 @@
+"""How a rollout ended, what it gives, and where it was outside the training range."""
+
+from __future__ import annotations
+
+import enum
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+
+from dfsm.core.types import Array
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmWarning, printable
+from dfsm.models.departures import Departure, departures, told
+from dfsm.models.dfsm import DFSM
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
+from dfsm.simulation.drawn_run import DrawnRun
+from dfsm.simulation.integrate import Rollout
+
+# A rollout ends where a state is this many times its training half-range from the middle.
+ESCAPE = 10.0
+# Share of the time outside the training range above which a user is warned.
+MUCH_OUTSIDE = 0.05
+
+
+class Status(enum.Enum):
+    """How a simulation ended; the value says what it means and what to do."""
+
+    COMPLETED = "completed"
+    LEFT_REGION = (
+        "stopped where a state left the training range by a factor of ten: the model is unstable "
+        "there; look at its eigenvalues, or train on runs that cover this case"
+    )
+    NOT_FINITE = (
+        "stopped where a state was no longer finite: use a smaller step or a stiff method, and "
+        "look at the model's eigenvalues"
+    )
+    SOLVER_FAILED = (
+        "the adaptive solver gave up: loosen rtol and atol, use kvaerno5 for a stiff model, or rk4"
+    )
+
+
+@dataclass(frozen=True)
+class Simulation(DrawnRun):
+    """A rollout.
+
+    Attributes
+    ----------
+    trajectory
+        States and outputs on the run's time mesh, up to where the rollout ended; roles are set.
+    status
+        How it ended.
+    ended
+        Last time in s.
+    reason
+        For a rollout that did not complete, the state that left the range and where; else "".
+    outside
+        Share of the time with any input outside its training range.
+    wall_time
+        Seconds it took (of the whole batch divided by its runs), without compilation when warm.
+    note
+        What was done otherwise than asked for: shorter steps, or another method; else "".
+    departures
+        Where it left the training range, those that lasted longest first.
+    distance
+        From the training data at every sample, ``(time,)``: 1 is as far as is usual.
+    """
+
+    trajectory: Trajectory
+    status: Status
+    ended: float
+    reason: str
+    outside: float
+    wall_time: float = 0.0
+    note: str = ""
+    departures: tuple[Departure, ...] = ()
+    distance: Array = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
+        return (
+            f"<Simulation of {printable(run.name)}: {outcome}, {run.time[0]:g} to "
+            f"{self.ended:g} s, {len(run)} samples; {printable(self.message)}>"
+        )
+
+    @property
+    def message(self) -> str:
+        """One sentence on the outcome."""
+        more = f"; {self.note}" if self.note else ""
+        if self.status is Status.COMPLETED:
+            where = f": {told(self.departures)}" if self.departures else ""
+            return f"{self.outside:.1%} of the time outside the training range{where}{more}"
+        return f"{self.reason}; {self.status.value}{more}"
+
+
+def judge(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) -> Simulation:
+    """Judge how a rollout ended, and where it was outside the training range.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    run
+        What drove it, for its name.
+    driven
+        The exogenous channels in the window.
+    rollout
+        At their samples.
+    """
+    s = model.signals
+    columns = s.state_columns
+    low, high = np.asarray(model.region.low)[columns], np.asarray(model.region.high)[columns]
+    middle, half = (low + high) / 2, (high - low) / 2
+    x = rollout.states
+    finite = np.isfinite(x)
+    escaped = ~finite | (np.abs(np.where(finite, x, 0.0) - middle) > ESCAPE * half)
+    rows = np.flatnonzero(escaped.any(axis=1))
+    end = int(rows[0]) if len(rows) else len(x)
+    status, reason = Status.COMPLETED, ""
+    # An adaptive solver that gives up leaves the samples beyond without a value.
+    if not rollout.solved and (end == len(x) or not finite[end].all()):
+        status, reason = Status.SOLVER_FAILED, f"no solution beyond {driven.time[end - 1]:g} s"
+    elif len(rows):
+        column = int(np.flatnonzero(escaped[end])[0])
+        status = Status.LEFT_REGION if finite[end].all() else Status.NOT_FINITE
+        reason = (
+            f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
+            f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
+        )
+        # The sample where it left shows which way the model went.
+        end += status is Status.LEFT_REGION
+    values = np.concatenate([x, rollout.outputs], axis=1)[: max(2, end)]
+    values[end:] = np.nan  # a trajectory has two samples, even if the first step failed
+    channels = (*s.states, *s.outputs)
+    time = driven.time[: len(values)]
+    left, weights = rollout.outside[:end], _weights(driven.time[:end])
+    seen: tuple[Departure, ...] = ()
+    if left.any():
+        exogenous = s.order.split_exogenous(jnp.asarray(driven.values[:end]))
+        inputs = np.asarray(model.join(x[:end], *exogenous))
+        seen = departures(model.region, s.inputs, time[:end], inputs, left, weights)
+    return Simulation(
+        trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
+        status=status,
+        ended=float(time[end - 1]),
+        reason=reason,
+        outside=float(mean_over(left, weights)),
+        departures=seen,
+        # A copy: the rollout's arrays may be parts of larger ones.
+        distance=np.sqrt(rollout.distance[: len(values)]),
+    )
+
+
+def _weights(time: Array) -> Array | None:
+    return None if len(time) < 2 else weights_over_time([time])
+
+
+def tell(results: Sequence[Simulation]) -> None:
+    """Warn of rollouts that ended early, took other steps or were outside the training range."""
+    ended = [r for r in results if r.status is not Status.COMPLETED]
+    for r in ended:
+        warnings.warn(f"{r.trajectory.name}: {r.message}", DfsmWarning, stacklevel=4)
+    cut = [r for r in results if r.note and r.status is Status.COMPLETED]
+    if cut:
+        more = f" ({len(cut)} of the {len(results)} rollouts alike)" if len(cut) > 1 else ""
+        warnings.warn(f"{cut[0].trajectory.name}: {cut[0].note}{more}", DfsmWarning, stacklevel=4)
+    outside = [r for r in results if r.status is Status.COMPLETED and r.outside > MUCH_OUTSIDE]
+    if outside:
+        worst = max(outside, key=lambda r: r.outside)
+        warnings.warn(
+            f"{len(outside)} of {len(results)} rollouts spend more than {MUCH_OUTSIDE:.0%} of the "
+            f"time outside the training range, {worst.trajectory.name} most ({worst.outside:.1%}): "
+            f"{told(worst.departures)}",
+            DfsmWarning,
+            stacklevel=4,
+        )
