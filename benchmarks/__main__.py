@@ -1,8 +1,13 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
+<<<<<<< HEAD
     [unseen] [limits] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid] [peer]
     [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
+=======
+    [unseen] [limits] [intervals] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid]
+    [peer] [dymos] [gpu] [fuzz] [kill] [feedback]
+>>>>>>> 971df48 (Intervals from training runs alone, with models that were fitted without some of them; splits hold out other runs each time)
 
 Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER`` for published
 records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
@@ -34,6 +39,7 @@ from benchmarks import (
     field,
     fuzz,
     gpu,
+    intervals,
     kill,
     limits,
     loops,
@@ -64,6 +70,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "rollouts": rollouts.run,
     "unseen": unseen.run,
     "limits": limits.run,
+    "intervals": intervals.run,
     "matched": matched.run,
     "control": control.run,
     "codesign": codesign.run,
@@ -107,6 +114,8 @@ def main() -> None:
             "sysid": (arguments.data,),
         }
         figures[name] = PARTS[name](*told.get(name, ()))
+        if name == "intervals":
+            print("\n".join(intervals.intervals_table(figures[name])), file=sys.stderr)
         if name == "startup":
             print("\n".join(startup.startup_table(figures[name])), file=sys.stderr)
         if name == "memory":

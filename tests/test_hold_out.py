@@ -50,6 +50,18 @@ def test_the_operating_point_between_others_is_held_out_first():
     assert all(len(winds(held)) == 1 for _, held in splits)
 
 
+def test_several_splits_hold_out_other_runs_each_time():
+    """One run alone would decide for all: drawn anew each time, it often is the same again."""
+    data = runs(6, 12, 18, seeds=2)
+    parts = divisions(data, HoldOut(share=0.34, splits=3), seed=3)
+    assert set.union(*(names(held) for _, held in parts)) == names(data)
+    assert sum(len(held) for _, held in parts) == len(data)
+    # The first is what a single split draws; when all had their turn, some have another.
+    ((_, alone),) = divisions(data, HoldOut(share=0.34), seed=3)
+    assert names(parts[0][1]) == names(alone)
+    assert len(divisions(data, HoldOut(share=0.34, splits=5), seed=3)) == 5
+
+
 def test_as_many_operating_points_as_come_nearest_to_the_share():
     ((_, held),) = divisions(runs(6, 8, 10, 12, 14, seeds=2), HoldOut(by="wind", share=0.45))
     assert len(winds(held)) == 2

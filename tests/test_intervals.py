@@ -16,6 +16,7 @@ from dfsm.fitting.fit import fit
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.signals import Provenance
+from dfsm.selection.left_out import _pieces, cross_calibrate
 from dfsm.simulation.simulate import simulate
 from dfsm.validation.calibrate import calibrate
 from dfsm.validation.intervals import load_intervals
@@ -226,3 +227,49 @@ def test_bad_input(model, intervals):
         calibrate(model, [run(1), run(2)])
     with pytest.raises(DfsmError, match=r"level is 1.5, expected a share between 0 and 1"):
         calibrate(model, [run(1), run(2), run(3)], level=1.5)
+
+
+# -- from the training runs alone -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def crossed(model):
+    return cross_calibrate(model, [run(seed) for seed in range(8)], SETTINGS)
+
+
+@pytest.mark.slow
+def test_training_runs_that_are_left_out_in_turn_calibrate_too(model, crossed):
+    """No run beside those of the fit is asked for, and new runs lie inside about as promised."""
+    new = [run(seed) for seed in range(200, 240)]
+    shares = [crossed.coverage(simulate(model, r), r, r) for r in new]
+    np.testing.assert_allclose(np.mean(shares, axis=0), 0.9, atol=0.08)
+    assert crossed.runs == tuple(f"run{k}" for k in range(8))
+    # Errors begin at the record: an interval is narrow there.
+    assert (crossed.growth.along[0] < 0.5).all()
+    assert "test runs calibrated the intervals" in "".join(
+        validate(model, [run(0)], intervals=crossed).warnings
+    )
+
+
+def test_the_law_grows_with_the_distance_of_runs_far_from_all_others(model):
+    """A rollout far outside has wider intervals than one inside, at every time alike."""
+    growth = replace(
+        calibrate(model, [run(seed) for seed in range(100, 104)]).growth, power=np.ones(2), knee=1.0
+    )
+    near, far = (growth.factor(TIME, np.full(len(TIME), d)) for d in (1.0, 7.0))
+    np.testing.assert_allclose(far / near, 5.0)
+
+
+def test_one_record_is_cut_into_pieces():
+    with pytest.raises(DfsmError, match="1 runs of 401 samples are too few to leave some out"):
+        _pieces([run(0)], SETTINGS)
+    long = Trajectory(
+        np.arange(4010) * 0.1,
+        np.tile(run(0).values, (10, 1)),
+        run(0).channels,
+        name="long",
+    )
+    pieces, settings = _pieces([long], replace(SETTINGS, start=0.0))
+    assert settings.start is None
+    assert [p.name for p in pieces] == [f"long, part {k}" for k in range(1, 7)]
+    assert sum(map(len, pieces)) == 4010

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import files_of
+from conftest import changed, files_of, write_config
 from dfsm.core.bundle import checksum
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
@@ -95,10 +95,15 @@ def test_bad_input_is_told_and_costs_nothing(here, dfsm, fitted, fresh, interval
     for name in ("c1", "c2", "c3"):
         shutil.copy(fresh / f"{name}.parquet", ".")
     Path("x.json").write_text('{"format": 1, "runs": []}')
+    write_config(Path("other.yaml"), changed("data", "train", value=["c1.parquet", "c2.parquet"]))
     before = files_of(here)
     runs = ("c1.parquet", "c2.parquet", "c3.parquet")
     cases = {
         "at least 3 runs, 2 were given": ("calibrate", "m", *runs[:2], "-o", "n.json"),
+        "give either files or --config": ("calibrate", "m", "-o", "n.json"),
+        "not fitted to the runs of other.yaml: it knows 0 of these 2": (
+            *("calibrate", "m", "-o", "n.json", "--config", "other.yaml"),
+        ),
         "level is 90.0, expected a share": ("calibrate", "m", *runs, "-o", "n.json", "--level", 90),
         "c1.parquet is one of the files to read": ("calibrate", "m", *runs, "-o", "c1.parquet"),
         "manifest.json is one of the files": ("calibrate", "m", *runs, "-o", "m/manifest.json"),

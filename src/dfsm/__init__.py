@@ -78,6 +78,7 @@ if TYPE_CHECKING:
     from dfsm.refinement.settings import RefineSettings
     from dfsm.report import write_model_card, write_report, write_solution_report
     from dfsm.selection.compare import RankedCandidate, Ranking, compare
+    from dfsm.selection.left_out import cross_calibrate
     from dfsm.selection.trial import Candidate, Outcome
     from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
     from dfsm.simulation.loop_cases import ClosedLoopSettings
@@ -192,6 +193,7 @@ _HOME = {
     "Ranking": "selection.compare",
     "compare": "selection.compare",
     "calibrate": "validation.calibrate",
+    "cross_calibrate": "selection.left_out",
     "Intervals": "validation.intervals",
     "load_intervals": "validation.intervals",
     "OptimalControlProblem": "control",

@@ -141,7 +141,11 @@ class Dataset(Sequence[Trajectory]):
         return tuple(tuple(group) for group in groups)
 
     def split(
-        self, test_fraction: float = 0.2, seed: int = 0, together: Iterable[str] = ()
+        self,
+        test_fraction: float = 0.2,
+        seed: int = 0,
+        together: Iterable[str] = (),
+        drawn: Sequence[str] = (),
     ) -> tuple[Dataset, Dataset]:
         """Split by run, never within one: neighbouring samples are not independent.
 
@@ -154,6 +158,8 @@ class Dataset(Sequence[Trajectory]):
         together
             Channels: runs in which they are the same stay on one side, see `matched`, unless that
             is all runs.
+        drawn
+            Digests of runs that were test runs before, once for each time: the others come first.
 
         Returns
         -------
@@ -176,7 +182,9 @@ class Dataset(Sequence[Trajectory]):
         # A large group must not leave next to nothing to train with.
         most = max(n_test, len(self) // 2)
         test: set[int] = set()
-        for k in np.random.default_rng(seed).permutation(len(groups)):
+        often = [max(drawn.count(self.runs[i].digest) for i in group) for group in groups]
+        order = np.random.default_rng(seed).permutation(len(groups))
+        for k in sorted(order, key=lambda k: often[k]):
             if len(test) < n_test and len(test) + len(groups[k]) <= most:
                 test.update(groups[k])
         return (

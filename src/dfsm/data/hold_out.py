@@ -31,7 +31,7 @@ class HoldOut:
         Channel or parameter whose means tell operating points apart, e.g. a wind speed: all runs of
         one or more of them are held out, those between others first. None draws single runs.
     splits
-        Divisions into two, each with other runs held out.
+        Divisions into two, each with other runs held out as long as there are any.
     """
 
     share: float = 0.2
@@ -90,7 +90,12 @@ def divisions(
         points.
     """
     if hold_out.by is None:
-        return [data.split(hold_out.share, seed + k, together) for k in range(hold_out.splits)]
+        drawn, together = list[str](), tuple(together)
+        parts = list[tuple[Dataset, Dataset]]()
+        for k in range(hold_out.splits):
+            parts.append(data.split(hold_out.share, seed + k, together, drawn))
+            drawn += [run.digest for run in parts[-1][1]]
+        return parts
     groups = operating_points(data, hold_out.by, hold_out.share, start, stop)
     if hold_out.splits > len(groups):
         raise DfsmError(

@@ -14,6 +14,7 @@ from dfsm.errors import DfsmError
 from dfsm.exports.program import Program
 from dfsm.exports.translate import UntranslatableError, translated
 from dfsm.models.dfsm import DFSM, functions_of_points
+from dfsm.models.inputs import GROUPS as INPUTS
 from dfsm.models.latents import at_rest
 from dfsm.simulation.fastest import REACH, fastest_rates
 
@@ -82,6 +83,10 @@ def description(model: DFSM) -> dict[str, Any]:
         told[group] = [{"name": c.name, "unit": c.unit} for c in channels]
         for entry, value in zip(told[group], start.get(group, ()), strict=False):
             entry["start"] = float(value)
+    ranges = np.stack([model.region.low, model.region.high], axis=1).tolist()
+    order = [entry for group in INPUTS for entry in told[group]]
+    for entry, trained in zip(order, ranges, strict=True):
+        entry["trained"] = trained
     kinds = s.between_samples()
     for entry, kind in zip([*told["controls"], *told["disturbances"]], kinds, strict=False):
         entry["between_samples"] = kind

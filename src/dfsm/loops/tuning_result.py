@@ -14,7 +14,9 @@ from dfsm.core.drawing import DrawnByRun
 from dfsm.core.files import json_value
 from dfsm.core.types import Array
 from dfsm.loops.tuning_problem import TuningProblem
+from dfsm.models.departures import told
 from dfsm.simulation.closed_loop import ClosedLoopRun
+from dfsm.simulation.outcome import MUCH_OUTSIDE
 
 # Share of a parameter's bounds within which it is at one of them.
 _AT_BOUND = 1e-3
@@ -143,7 +145,19 @@ class TuningResult(DrawnByRun):
             text += f"; {worst}"
         if names := self.at_bounds:
             text += f"; {', '.join(names)} at a bound: widen it if more is wanted"
+        if where := self._outside():
+            text += f"; {where}"
         return text
+
+    def _outside(self) -> str:
+        """Where the tuned loops leave the training range more than a little; empty if none does."""
+        worst = max(self.loops, key=lambda loop: loop.outside, default=None)
+        if worst is None or worst.outside <= MUCH_OUTSIDE:
+            return ""
+        return (
+            f"the tuned loops are outside the training range for up to {worst.outside:.1%} of the "
+            f"time ({worst.trajectory.name}): {told(worst.departures)}"
+        )
 
     def _worst(self) -> str:
         if not self.violation > 0:

@@ -88,8 +88,8 @@ def departures(
         return ()
     beyond = np.asarray(region.beyond(inputs)) & outside[:, None]
     found = [
-        _beyond(region, int(k), channels[k], inputs[rows, k], (share, first))
-        for k in np.flatnonzero(beyond.any(axis=0))
+        _beyond(region, k, channels[k], inputs[rows, k], (share, first))
+        for k in np.flatnonzero(beyond.any(axis=0)).tolist()
         for rows, share, first in [_when(beyond[:, k], time, weights)]
     ]
     together = outside & ~beyond.any(axis=1)
@@ -141,7 +141,7 @@ def _together(
     # What each signal adds to the squared distance; all together make it up.
     back = np.einsum("nkr,kri->nki", np.einsum("nki,kri->nkr", apart, W), W)
     added = np.einsum("nk,nki,nki->ni", shares, apart, back).mean(axis=0)
-    order = np.argsort(-added)
+    order = np.argsort(-added).tolist()
     alike = [k for k in order[:_TOGETHER] if added[k] >= _ALIKE * added[order[0]]]
     names = tuple(channels[k].name for k in (alike if len(alike) > 1 else order[:2]))
     farthest = float(np.sqrt(np.max(np.asarray(region.distance(inputs)))))

@@ -197,7 +197,7 @@ def _batches(model: DFSM, meshes: Sequence[Mesh]) -> Iterator[list[int]]:
         rows.sort(key=lambda i: (len(meshes[i].time), i))
         longest = meshes[rows[-1]]
         splines = 3 * len(_kind(longest).splines)
-        wide = 3 + len(s.exogenous) + splines + len(s.states) + len(s.outputs) + len(s.field)
+        wide = 2 + len(s.exogenous) + splines + len(s.states) + len(s.outputs) + len(s.field)
         each = 8 * _COPIES * wide * padded(len(longest.time), _FEWEST_SAMPLES)
         most = min(_MOST_RUNS, max(1, int(_SHARE * _free_memory()) // each))
         parts = -(-len(rows) // most)

@@ -15,6 +15,7 @@ import numpy as np
 
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import require
+from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
@@ -28,6 +29,8 @@ from dfsm.validation.validate import listed, of_the_fit
 
 # Calibration runs below which a quantile over runs means nothing.
 _FEWEST = 3
+# Groups of which the extremes are left out.
+_MANY_GROUPS = 6
 # A law for each run left out takes long with many, and says the same.
 _MOST_GROUPS = 8
 
@@ -107,18 +110,21 @@ def intervals_of(
         What a reader should know.
     """
     s, grid = model.signals, np.asarray(model.region.grid)
-    scores = []
+    scores = list[Array]()
     for group in dict.fromkeys(part.group for part in parts):
         law = law_of([p for p in parts if p.group != group], grid)
-        scores += [np.abs(p.errors) / law.at(p) for p in parts if p.group == group]
+        mine = [np.abs(p.errors) / law.at(p) for p in parts if p.group == group]
+        scores.append(np.concatenate(mine))
     law = law_of(parts, grid)
+    # Few runs may all have been easy: the new one counts as a run that nothing is known of.
+    multiple = _multiple(scores, level + (1 - level) / (1 + len(runs)))
     channels = (*s.observed, *s.outputs)
     return Intervals(
         channels=tuple(c.name for c in channels),
         units=tuple(c.unit for c in channels),
         schedule=model.schedule,
         grid=grid,
-        half_width=np.quantile(np.concatenate(scores), level, axis=0) * law.scale,
+        half_width=multiple * law.scale,
         level=level,
         runs=tuple(r.name for r in runs),
         digests=tuple(r.select(s.recorded).digest for r in runs),
@@ -126,6 +132,25 @@ def intervals_of(
         schedule_unit=next((c.unit for c in s.inputs if c.name == model.schedule), ""),
         growth=law.growth,
     )
+
+
+def _multiple(scores: Sequence[Array], level: float) -> Array:
+    """What errors over what is expected of them are below for a share of the time, ``(channel,)``.
+
+    The share is the mean over groups of runs. Of many groups the ones with the largest and the
+    smallest errors are left out: where a model without some runs fails altogether, that is no
+    measure for the one with all.
+    """
+    few = len(scores) < _MANY_GROUPS
+    found = []
+    for column in range(scores[0].shape[1]):
+        ordered = [np.sort(s[:, column]) for s in scores]
+        tried = np.unique(np.concatenate(ordered))
+        inside = [np.searchsorted(s, tried, side="right") / len(s) for s in ordered]
+        shares = np.sort(np.stack(inside), axis=0)
+        share = (shares if few else shares[1:-1]).mean(axis=0)
+        found.append(tried[min(int(np.searchsorted(share, level)), len(tried) - 1)])
+    return np.array(found)
 
 
 def _leaks(model: DFSM, runs: Sequence[Trajectory]) -> list[str]:

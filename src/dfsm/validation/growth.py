@@ -5,9 +5,9 @@ they are made; and it is off by more where no training run was. With τ the time
 D̄ the distance from the training data over the recent past (1 is as far as is usual), a half-width
 is
 
-    h(schedule) · a(τ) · ((1 + D̄²) / 2)^(p / 2) ,
+    h(schedule) · a(τ) · ((k² + D̄²) / (k² + 1))^(p / 2) ,
 
-per channel, with h, a and p from rollouts over runs that were left out.
+per channel, with h, a, p and k from rollouts over runs that were left out.
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ from dfsm.core.types import Array
 # Lags at which the growth is known: this many, each half of the next, up to the longest rollout.
 _LAGS = 9
 # Powers of the distance that are tried.
-_POWERS = np.linspace(0.0, 1.5, 16)
+_POWERS = np.linspace(0.0, 3.0, 16)
+# Distances k below which nothing depends on it.
+_KNEES = (0.25, 1.0)
 # How far back the distance counts, as shares of the longest rollout.
 _MEMORIES = (0.0, 0.02, 0.1)
 # Rounds in which the parts of the law are fitted one after the other.
 _ROUNDS = 4
 # Samples that enter, of all rollouts together.
-_SAMPLES = 20_000
+_SAMPLES = 10_000
 # What all errors say weighs as much at every schedule value as this share of a rollout, lest one
 # run decides there.
 _LEANING = 0.25
@@ -74,6 +76,8 @@ class Growth:
         a(τ) there, shape ``(lag, channel)``: 1 at the last one, and never falling.
     power
         p, shape ``(channel,)``.
+    knee
+        k, the distance from which on it counts.
     memory
         Time constant in s over which the distance is averaged; 0 takes it as it is.
     farthest
@@ -83,6 +87,7 @@ class Growth:
     lag: Array
     along: Array
     power: Array
+    knee: float
     memory: float
     farthest: float
 
@@ -104,7 +109,9 @@ class Growth:
         distance
             From the training data, ``(time,)``.
         """
-        return self._along(lag) * _far(recent(lag, distance, self.memory), self.power)
+        return self._along(lag) * np.exp(
+            _far(recent(lag, distance, self.memory), self.knee)[:, None] * self.power
+        )
 
     def _along(self, lag: Array) -> Array:
         inside = _hats(_octaves(lag), _octaves(self.lag)) @ self.along
@@ -126,8 +133,9 @@ def recent(time: Array, distance: Array, memory: float) -> Array:
     return np.sqrt(np.interp(time, mesh, averaged))
 
 
-def _far(distance: Array, power: Array) -> Array:
-    return ((1 + distance[:, None] ** 2) / 2) ** (power / 2)
+def _far(distance: Array, knee: float) -> Array:
+    """Log of what a power of one multiplies half-widths by, ``(time,)``."""
+    return 0.5 * np.log((knee**2 + distance**2) / (knee**2 + 1))
 
 
 @dataclass(frozen=True)
@@ -169,8 +177,10 @@ def law_of(parts: Sequence[RolloutErrors], grid: Array) -> Law:
     tried = []
     for share in _MEMORIES:
         memory = longest * share
-        law = _Likeliest([_thinned(p, memory, len(parts)) for p in parts], grid, longest)
-        tried.append((law.cost, law.law(memory)))
+        thinned = [_thinned(p, memory, len(parts)) for p in parts]
+        for knee in _KNEES:
+            law = _Likeliest(thinned, grid, longest, knee)
+            tried.append((law.cost, law.law(memory)))
     return min(tried, key=lambda found: found[0])[1]
 
 
@@ -188,12 +198,15 @@ def _thinned(part: RolloutErrors, memory: float, count: int) -> RolloutErrors:
 class _Likeliest:
     """The parts of a law, fitted in turn to squared errors until they fit together."""
 
-    def __init__(self, parts: Sequence[RolloutErrors], grid: Array, longest: float) -> None:
+    def __init__(
+        self, parts: Sequence[RolloutErrors], grid: Array, longest: float, knee: float
+    ) -> None:
         lag, schedule, distance = (
             np.concatenate([getattr(p, name) for p in parts])
             for name in ("lag", "schedule", "distance")
         )
         squares = np.concatenate([p.errors for p in parts]) ** 2
+        self.knee = knee
         self.grid, self.lag = grid, longest / 2.0 ** np.arange(_LAGS)[::-1]
         # Relative, so that a channel that is always zero has no error to be divided by.
         self.size = np.sqrt(np.maximum(squares.mean(axis=0), np.finfo(float).tiny))
@@ -202,7 +215,8 @@ class _Likeliest:
         self.points = _hats(schedule, grid)
         self.lags = _hats(_octaves(lag), _octaves(self.lag))
         # Log of what the distance multiplies squared errors by, for every power.
-        self.far = np.log((1 + distance**2) / 2)[:, None] * _POWERS
+        self.far = 2 * _far(distance, knee)[:, None] * _POWERS
+        self.near = np.exp(-self.far)
         channels, leaning = squares.shape[1], _LEANING * len(lag) / len(parts)
         self.scale = np.ones((len(grid), channels))
         self.along = np.ones((_LAGS, channels))
@@ -218,7 +232,9 @@ class _Likeliest:
             along = np.stack([_rising(a, weights) for a in along.T], axis=1)
             self.along = np.maximum(along / np.maximum(along[-1], _LEAST), _LEAST)
             left = self.squares / (self._sized() * self._grown())
-            costs = [self.far.mean(axis=0) + np.log(_mean_over(c, self.far)) for c in left.T]
+            # Mean squares relative to what every power expects, of which the size is free.
+            means = np.maximum(left.T @ self.near / len(left), _LEAST)
+            costs = self.far.mean(axis=0) + np.log(means)
             self.power = np.argmin(costs, axis=1)
         expected = self._sized() * self._grown() * self._apart()
         self.cost = float(np.sum(np.mean(np.log(expected) + self.squares / expected, axis=0)))
@@ -230,17 +246,14 @@ class _Likeliest:
         return self.lags @ self.along
 
     def _apart(self) -> Array:
-        return np.exp(self.far[:, self.power])
+        return 1 / self.near[:, self.power]
 
     def law(self, memory: float) -> Law:
         """As root mean squares, in the units of the errors."""
-        growth = Growth(self.lag, np.sqrt(self.along), _POWERS[self.power], memory, self.farthest)
+        growth = Growth(
+            self.lag, np.sqrt(self.along), _POWERS[self.power], self.knee, memory, self.farthest
+        )
         return Law(self.grid, np.sqrt(self.scale) * self.size, growth)
-
-
-def _mean_over(squares: Array, far: Array) -> Array:
-    """Mean of squares relative to what every power expects, ``(power,)``."""
-    return np.maximum(np.exp(-far).T @ squares / len(squares), _LEAST)
 
 
 def _octaves(lag: Array) -> Array:

@@ -179,6 +179,7 @@ class _Growth(BaseModel):
     lag: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2)]
     along: list[list[Annotated[float, Field(ge=0, allow_inf_nan=False)]]]
     power: list[Annotated[float, Field(ge=0, allow_inf_nan=False)]]
+    knee: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     memory: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     farthest: Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -258,8 +259,8 @@ def _growth(path: Path, content: _File) -> Growth | None:
     shaped = len(told.along) == shape[0] and {len(row) for row in told.along} == {shape[1]}
     if not shaped or len(told.power) != shape[1] or not (np.diff(told.lag) > 0).all():
         raise _foreign(path, "its growth is not that of its channels")
-    values = map(np.array, (told.lag, told.along, told.power))
-    return Growth(*values, told.memory, told.farthest)
+    lag, along, power = map(np.array, (told.lag, told.along, told.power))
+    return Growth(lag, along, power, told.knee, told.memory, told.farthest)
 
 
 def _same_channels(ours: Sequence[Channel], theirs: Sequence[Channel]) -> bool:

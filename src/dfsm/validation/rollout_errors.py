@@ -58,24 +58,30 @@ def rollout_errors(
         truths.append(recorded_channels(model, window, seen))
     parts, ended = list[RolloutErrors](), list[Simulation]()
     for share in _BEGINNINGS:
-        begins = [w.time[0] + share * w.duration for w in windows]
+        begins = [float(w.time[0] + share * w.duration) for w in windows]
         for begin in sorted(set(begins)):
             rows = [k for k, b in enumerate(begins) if b == begin]
-            rows = [k for k in rows if (windows[k].time >= begin).sum() >= _FEWEST_SAMPLES]
-            if share and not rows:
+            if share:
+                rows = [k for k in rows if (windows[k].time >= begin).sum() >= _FEWEST_SAMPLES]
+            if not rows:
                 continue
-            rows = rows or [k for k, b in enumerate(begins) if b == begin]
-            first = start if share == 0 else float(begin)
-            with hushed():
-                rollouts = simulate(
-                    model, [runs[k] for k in rows], start=first, stop=stop, settings=settings
-                )
+            rollouts = _simulated(model, [runs[k] for k in rows], (begin, stop), settings)
             for k, rollout in zip(rows, rollouts, strict=True):
-                if rollout.status is not Status.COMPLETED:
+                if rollout.status is Status.COMPLETED:
+                    parts.append(_compared(model, runs[k], rollout, truths[k], groups[k]))
+                else:
                     ended.append(rollout)
-                    continue
-                parts.append(_compared(model, runs[k], rollout, truths[k], groups[k]))
     return parts, ended
+
+
+def _simulated(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    window: tuple[float, float | None],
+    settings: SimulationSettings | None,
+) -> list[Simulation]:
+    with hushed():
+        return simulate(model, runs, start=window[0], stop=window[1], settings=settings)
 
 
 def _compared(
