@@ -1,13 +1,8 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-<<<<<<< HEAD
-    [unseen] [limits] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid] [peer]
-    [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
-=======
     [unseen] [limits] [intervals] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid]
-    [peer] [dymos] [gpu] [fuzz] [kill] [feedback]
->>>>>>> 971df48 (Intervals from training runs alone, with models that were fitted without some of them; splits hold out other runs each time)
+    [peer] [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
 
 Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER`` for published
 records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
