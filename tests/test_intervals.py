@@ -23,7 +23,11 @@ from dfsm.validation.intervals import load_intervals
 from dfsm.validation.validate import validate
 from systems import wander
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning")
+# That a force is hidden is told, and is the point here.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*rollouts spend:dfsm.errors.DfsmWarning"),
+    pytest.mark.filterwarnings("ignore:derivatives are not to be fitted:dfsm.errors.DfsmWarning"),
+]
 
 TIME = np.arange(0, 40.01, 0.1)
 SETTINGS = FitSettings(
