@@ -181,7 +181,7 @@ def _read(
         if "RESOURCE_EXHAUSTED" not in str(error) or len(rows) == 1:
             raise
     if results is not None:
-        yield rows, results  # pyright: ignore[reportReturnType]
+        yield rows, results
         return
     for half in (rows[: len(rows) // 2], rows[len(rows) // 2 :]):
         yield from _read(model, case, pool, half, _sent(model, case, pool, half))
