@@ -8,7 +8,8 @@ Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER
 records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
 there, and `fuzz` and `kill`, which damage inputs and end commands for hours
 (``fuzz --inputs 20000``).
-``[startup] [--before COMMIT]`` measures cold processes, of an earlier build beside this one.
+``[startup] [--before COMMIT]`` measures cold processes, of an earlier build beside this one, and
+`install` the size of the environment.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from benchmarks import (
     field,
     fuzz,
     gpu,
+    install,
     intervals,
     kill,
     limits,
@@ -60,6 +62,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "speed": speed.run,
     "startup": startup.run,
     "memory": memory.run,
+    "install": install.run,
     "parameters": parameters.run,
     "scaling": scaling.run,
     "rollouts": rollouts.run,
@@ -109,12 +112,14 @@ def main() -> None:
             "sysid": (arguments.data,),
         }
         figures[name] = PARTS[name](*told.get(name, ()))
-        if name == "intervals":
-            print("\n".join(intervals.intervals_table(figures[name])), file=sys.stderr)
-        if name == "startup":
-            print("\n".join(startup.startup_table(figures[name])), file=sys.stderr)
-        if name == "memory":
-            print("\n".join(memory.memory_table(figures[name])), file=sys.stderr)
+        tables = {
+            "intervals": intervals.intervals_table,
+            "startup": startup.startup_table,
+            "memory": memory.memory_table,
+            "install": install.install_table,
+        }
+        if name in tables:
+            print("\n".join(tables[name](figures[name])), file=sys.stderr)
     print(json.dumps(json_value(figures), indent=2))
 
 

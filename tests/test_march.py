@@ -15,6 +15,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.corrective import GaussianUnits
 from dfsm.models.signals import Azimuth
 from dfsm.simulation import march
+from dfsm.simulation.fastest import fastest_rates
 from dfsm.simulation.integrate import Case, mesh_of
 from dfsm.simulation.simulate import SimulationSettings, Status, simulate
 from systems import linear_model, wander
@@ -105,6 +106,15 @@ def test_a_batch_that_the_device_refuses_is_halved(monkeypatch):
             result.trajectory.values, single.trajectory.values, rtol=0, atol=1e-11
         )
     assert tried == [4, 2, 2]
+
+
+def test_the_fastest_rate_of_a_run_does_not_depend_on_the_others():
+    values = [one.select(MODEL.signals.exogenous).values for one in RUNS]
+    values[1] = np.full_like(values[1], np.nan)
+    alone = [rate for one in values for rate in fastest_rates(MODEL, [one])]
+    assert fastest_rates(MODEL, values) == pytest.approx(alone, rel=1e-12)
+    assert alone[0] > 1
+    assert alone[1] in (0.0, alone[0])
 
 
 def test_few_sizes_are_compiled():

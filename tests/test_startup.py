@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import install
 from conftest import changed, write_config
 from dfsm.core.compile_cache import Entries, cache_folder
 
@@ -175,3 +176,11 @@ def test_timings_say_where_a_fit_spends_its_time(here, dfsm):
     )
     assert float(total) == pytest.approx(sum(told.values()), abs=0.1)
     assert (float(compiling) > 0) == (int(programs) > 0)
+
+
+def test_what_an_installation_takes_is_told_by_package():
+    core, more = install.needed("dfsm"), install.needed("dfsm", ("openfast",))
+    assert {"jax", "jaxlib", "numpy", "casadi"} <= core < more
+    assert more - core >= {"openfast-io"}
+    assert install.megabytes("numpy") > 10 > install.megabytes("typer") > 0
+    assert install.megabytes("no-such-package") == 0

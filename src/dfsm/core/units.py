@@ -155,7 +155,7 @@ def factor(source: str, target: str) -> float | None:
 
 def agree(a: str, b: str) -> bool:
     """Whether two units are the same, however they are spelled; an unknown one agrees with all."""
-    if not (known(a) and known(b)):
+    if a == b or not (known(a) and known(b)):
         return True
     change = conversion(a, b)
     return change is not None and abs(change[0] - 1) < 1e-12 and not change[1]

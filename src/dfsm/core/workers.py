@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.connection import wait
@@ -42,6 +42,14 @@ def default_jobs() -> int:
     On two processors shared with other work, two fits at a time took longer than one by one.
     """
     return max(1, processors() // 2)
+
+
+def in_threads(work: Callable[[T], R], tasks: Sequence[T]) -> list[R]:
+    """What work gives for every task, in their order; in threads, for work on arrays frees them."""
+    if len(tasks) <= 1:
+        return [work(task) for task in tasks]
+    with ThreadPoolExecutor(processors()) as pool:
+        return list(pool.map(work, tasks))
 
 
 def work_through(
@@ -116,6 +124,8 @@ def _begin(shared: Any, threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Read by XLA when it starts, which is later than this.
     os.environ.setdefault("NPROC", str(threads))
+    # On a GPU, the first process would take three quarters of its memory and leave none to others.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     threadpool_limits(limits=threads)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -58,7 +58,7 @@ def pulled(residuals: Residuals, columns: Sequence[int]) -> list[Second]:
     columns
         Inputs to look at.
     """
-    if residuals.unexplained < _UNEXPLAINED:
+    if not columns or residuals.unexplained < _UNEXPLAINED:
         return []
     centred = residuals.centred()
     if min(len(run) for run in centred.inputs) < 10 * max(_ORDERS):
@@ -115,15 +115,21 @@ def _whitened(centred: Residuals, size: Array, first: Array) -> tuple[Array, Arr
 
 def _foretold(series: Sequence[Array]) -> Array:
     """Coefficients of an autoregressive series, of the order that Schwarz's criterion takes."""
+    most = max(_ORDERS)
+    # The past of lower orders stands first, on the same samples: one factor serves all.
+    past_and_now = stacked(
+        [
+            np.column_stack([e[most - i : len(e) - i] for i in (*range(1, most + 1), 0)])
+            for e in series
+        ]
+    )
+    count, R = len(past_and_now), np.asarray(np.linalg.qr(past_and_now, mode="r"))
     best, least = np.zeros(1), np.inf
     for order in _ORDERS:
-        past = stacked(
-            [np.column_stack([e[order - 1 - i : -1 - i] for i in range(order)]) for e in series]
-        )
-        now = stacked([e[order:] for e in series])
-        taps = np.linalg.lstsq(past, now, rcond=None)[0]
-        left = max(float(np.mean((now - past @ taps) ** 2)), np.finfo(float).tiny)
-        score = len(now) * np.log(left) + order * np.log(len(now))
+        taps = np.linalg.lstsq(R[:, :order], R[:, -1], rcond=None)[0]
+        squares = float(np.sum((R[:, -1] - R[:, :order] @ taps) ** 2))
+        left = max(squares / count, np.finfo(float).tiny)
+        score = count * np.log(left) + order * np.log(count)
         if score < least:
             best, least = taps, score
     return best

@@ -100,7 +100,10 @@ def _regressed(u: Array, inputs: Array) -> tuple[Array, float]:
 
 def _lagged(x: Array, lag: float) -> Array:
     decay = float(np.exp(-1 / lag))
-    return scipy.signal.lfilter([1 - decay], [1.0, -decay], x, axis=0, zi=decay * x[:1])[0]
+    # As equations with two diagonals: SciPy's signal package takes a second to import.
+    bands = np.stack([np.ones(len(x)), np.full(len(x), -decay)])
+    driving = np.concatenate([x[:1], (1 - decay) * x[1:]])
+    return scipy.linalg.solve_banded((1, 0), bands, driving)
 
 
 def is_feedback(law: Law, A: Array, b: Array) -> bool:

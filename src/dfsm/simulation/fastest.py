@@ -44,17 +44,20 @@ def fastest_rates(model: DFSM, runs: Sequence[Array]) -> list[float]:
         0 where nothing is to be said.
     """
     some = [v[np.unique(np.linspace(0, len(v) - 1, _PLACES).astype(int))] for v in runs]
-    ends = np.cumsum([len(v) for v in some])[:-1]
-    return [_fastest(A) for A in np.split(_matrices(model, np.concatenate(some)), ends)]
+    begins = np.cumsum([0] + [len(v) for v in some[:-1]])
+    fastest = _fastest(_matrices(model, np.concatenate(some)))
+    # A run of which one place cannot be told is not told of at all.
+    rates = np.maximum.reduceat(fastest, begins)
+    return np.where(np.isnan(rates), 0.0, rates).tolist()
 
 
-def _fastest(A: Array) -> float:
-    """Of matrices ``(place, state, state)``."""
-    if not np.isfinite(A).all():
-        return 0.0
-    values = np.linalg.eigvals(A)
+def _fastest(A: Array) -> Array:
+    """Of matrices ``(place, state, state)``, one each; NaN where one is not finite."""
+    finite = np.asarray(np.isfinite(A).all(axis=(1, 2)))
+    values = np.linalg.eigvals(np.where(finite[:, None, None], A, 0.0))
     size = np.abs(values)
-    return float(size[values.real < size / 2].max(initial=0.0))
+    fastest = np.where(values.real < size / 2, size, 0.0).max(axis=1, initial=0.0)
+    return np.where(finite, fastest, np.nan)
 
 
 def _matrices(model: DFSM, inputs: Array) -> Array:

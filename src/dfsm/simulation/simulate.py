@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array
+from dfsm.core.workers import in_threads
 from dfsm.data.between import Chosen
 from dfsm.data.derivatives import differentiate
 from dfsm.data.trajectory import Trajectory
@@ -164,10 +165,9 @@ def simulate(
     for run in batch:
         run.columns((*names, *(model.signals.measured if initial is None else ())))
         require_field(run, model.signals.azimuth)
-    fields = [
-        r.select(model.signals.names("field")).window(start, stop).require_finite() for r in batch
-    ]
-    driven = [r.select(names).window(start, stop).require_finite() for r in batch]
+    field = model.signals.names("field")
+    fields = [r.select(field).window(start, stop).require_finite() for r in batch if field]
+    driven = in_threads(lambda r: r.select(names).window(start, stop).require_finite(), batch)
     for run in driven:
         require_constant(run, model.signals.names("parameters"))
     starts = None if initial is None else _starts(model, initial, len(batch))
@@ -180,7 +180,8 @@ def simulate(
         x0 = tell(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
             x0 = np.concatenate([x0, latents_from_past(model, batch[i], begins)])
-        return Case(drive, x0, initial_azimuth(model, batch[i], begins), fields[i].values)
+        turned = (fields[i] if fields else driven[i].select(())).values
+        return Case(drive, x0, initial_azimuth(model, batch[i], begins), turned)
 
     def judged(i: int, rollout: Rollout) -> Simulation:
         result = judge(model, batch[i], driven[i], rollout)
@@ -240,8 +241,7 @@ def _stepping(driven: Trajectory, rate: float, settings: SimulationSettings) -> 
     longest = float(np.diff(driven.time).max())
     step = longest if asked is None else min(asked, longest)
     parts = rate * step / REACH
-    # Beyond the second limit, no method would get anywhere.
-    if not 1 + 1e-9 < parts < _HOPELESS:
+    if not 1 + 1e-9 < parts < _HOPELESS:  # beyond, no method would get anywhere
         return _Stepping("rk4", asked)
     why = f"{step:.3g} s are too long for RK4 with the model's fastest eigenvalue, {rate:.3g} 1/s"
     if parts > _SWITCHED:
