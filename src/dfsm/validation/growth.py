@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from dfsm.core.types import Array
 
@@ -129,7 +129,7 @@ def recent(time: Array, distance: Array, memory: float) -> Array:
     mesh = np.linspace(time[0], time[-1], len(time))
     stay = np.exp(-(mesh[1] - mesh[0]) / memory)
     squares = np.interp(mesh, time, distance**2)
-    averaged, _ = lfilter([1 - stay], [1, -stay], squares, zi=stay * squares[:1])
+    averaged, _ = scipy.signal.lfilter([1 - stay], [1, -stay], squares, zi=stay * squares[:1])
     return np.sqrt(np.interp(time, mesh, averaged))
 
 
