@@ -165,17 +165,6 @@ def test_slopes_of_the_error(kind: str, recorded: Recorder) -> None:
         np.testing.assert_allclose(error.paths(w), own.paths(w), rtol=1e-12)
 
 
-def test_other_stretches_are_left_out(recorded: Recorder) -> None:
-    """Half a round later none of the same samples judge, and padding never does."""
-    runs = [recorded(1).select(["y", "u"]), recorded(2).window(0, 40).select(["y", "u"])]
-    windows = windows_of(runs, standard_of(runs, 1), ["hold"], 1)
-    other = windows.turned()
-    assert not np.any(windows.left_out * other.left_out)
-    inside = windows.used + windows.left_out
-    np.testing.assert_array_equal(other.used + other.left_out, inside)
-    np.testing.assert_allclose(other.left_out.sum(), windows.left_out.sum(), rtol=0.02)
-
-
 def test_stable_by_construction() -> None:
     """Whatever the weights are, P J + Jᵀ P is at most -2 ε P everywhere."""
     P = np.array([[1.0, 0.0], [0.0, 0.4]])

@@ -23,9 +23,7 @@ from dfsm.fitting.hidden.windows import Windows
 
 # Samples of one batch of windows: all batches have one shape, so that they are compiled once, and
 # memory does not grow with the data.
-BATCH = 3200
-# A state whose rate per sample is no more than this share of its spread does not move.
-_STILL = 1e-6
+_BATCH = 3200
 
 
 class HiddenError:
@@ -47,7 +45,7 @@ class HiddenError:
     def __init__(self, form: Form, windows: Windows, decay: Array | float = 0.0) -> None:
         self.form, self.windows, self._decay = form, windows, decay
         count, samples = windows.used.shape
-        each = max(1, min(count, BATCH // samples))
+        each = max(1, min(count, _BATCH // samples))
         self._batches = [slice(i, min(i + each, count)) for i in range(0, count, each)]
         self._size = each
         n, room = form.states, max(form.room, form.states)
@@ -69,21 +67,9 @@ class HiddenError:
         paths = np.concatenate(self._each(partial(_paths, self._computed), weights))
         return paths[..., : self.form.states]
 
-    def rates(self, weights: Array) -> Array:
-        """Spreads of the rates of the states along all windows, ``(state,)``."""
-        inside = self.windows.h > 0
-        moved = np.diff(self.paths(weights), axis=1)[inside] / self.windows.h[inside][:, None]
-        spread = np.sqrt(np.mean(moved**2, axis=0))
-        return np.where(np.isfinite(spread) & (spread > _STILL), spread, 1.0)
-
     def left_out(self, weights: Array) -> float:
         """Mean square of the errors where data are left out; 1 is as wrong as a constant."""
         return self._mean(weights, self.windows.left_out)
-
-    def squares_left_out(self, weights: Array) -> Array:
-        """Squared errors where data are left out, in the order of windows and time."""
-        r = self.paths(weights)[..., : self.form.outputs] - self.windows.y
-        return np.sum(r**2, axis=-1)[self.windows.left_out > 0]
 
     def trained(self, weights: Array) -> float:
         """Mean square of the errors that train."""

@@ -10,7 +10,6 @@ difference d of any two rollouts then falls by exp(-2 ε t) at least.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import factorial
 from typing import Literal
 
 import jax
@@ -82,30 +81,6 @@ class Form:
     def size(self) -> int:
         """Number of parameters."""
         return sum(int(np.prod(s)) for s in self.shapes)
-
-    def spreads(self, rates: Array) -> Array:
-        """How far parameters are expected from zero, ``(parameter,)``.
-
-        A coefficient changes a rate by about the spread of that rate, the more factors the less, as
-        in Taylor's series; units look along directions of length one.
-
-        Parameters
-        ----------
-        rates
-            Spreads of ẋ, ``(state,)``.
-        """
-        linear = np.repeat(rates[:, None], self.width + 1, axis=1)
-        if self.metric:
-            # There it holds a square root and skew entries instead of A.
-            linear[:, : self.states] = np.sqrt(rates)[:, None]
-        parts = [linear]
-        if self.kind == "polynomial":
-            orders = [sum(c < self.width for c in f) for f in self.factors]
-            parts.append(np.outer(rates, [1 / factorial(k) for k in orders]))
-        elif self.kind == "tanh":
-            parts.append(np.ones((self.units, self.width + 1)))
-            parts.append(np.repeat(rates[:, None], self.units, axis=1))
-        return np.concatenate([part.ravel() for part in parts])
 
     def parts(self, weights: jax.Array | Array) -> list[jax.Array]:
         """The parameter arrays as the equation takes them, A as it is in the equation."""

@@ -6,17 +6,19 @@ hidden states are tried, several nonlinear starts follow from the best of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
 
+from dfsm.core.types import Array
 from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.fitting.hidden.error import HiddenError
-from dfsm.fitting.hidden.form import Form
-from dfsm.fitting.hidden.race import forms, promising, raced
+from dfsm.fitting.hidden.form import Form, polynomial
 from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.hidden.starts import (
     Candidate,
@@ -24,22 +26,30 @@ from dfsm.fitting.hidden.starts import (
     improved,
     linear_start,
     nonlinear_start,
-    restarted,
+    runs_away,
     subspace,
 )
 from dfsm.fitting.hidden.windows import Standard, Windows, standard_of, windows_of
+from dfsm.models.corrective.polynomial import REACH
 
-# Another interpolation must lower the squared error on data left out to this share, and half the
-# step must change rollouts by no more than this share of it.
-_WORTH_A_KIND, _STEP_ERROR = 0.95, 0.01
+# A further hidden state must lower the squared error on data left out to this share; another
+# interpolation to this; and half the step must change rollouts by no more than this share of it.
+_WORTH_A_STATE, _WORTH_A_KIND, _STEP_ERROR = 0.7, 0.95, 0.01
+# Linear systems whose squared error is no more than so many times the least may be enough.
+_NEARLY = 2.0
 _MOST_STEPS = 8
+_MOST_MONOMIALS = 60
+# Polynomials go on to so many times what was recorded.
+_BEYOND = 1.5
 # Steps to follow a change of the integration, and to learn from all of many data at last.
 _FOLLOW, _LAST = 8, 5
+# Samples that tell the state at the start of a window.
+_HEAD = 100
 
 
 @dataclass(frozen=True)
 class Found:
-    """What came of a search.
+    """What a search found.
 
     Attributes
     ----------
@@ -100,17 +110,18 @@ def search(
     windows = windows_of(records, standard, kinds, 1, settings.samples)
     linear = _linear(records, standard, windows, settings)
     gains = {c: candidate.error for c, candidate in linear.items()}
-    first = promising(linear)[0] if settings.count is None else settings.count
+    first = _promising(linear)[0]
     kinds, kinds_tried = _interpolation(
         records, standard, linear[first], (kinds, open_kinds), settings
     )
     windows = windows_of(records, standard, kinds, 1, settings.samples)
-    best, tried = raced(linear, windows, settings, seed)
+    best, tried = _ascended(linear, windows, settings, seed)
     best, steps = _steps(records, standard, best, kinds, settings)
-    finer = windows_of(records, standard, kinds, steps, settings.samples)
     everything = windows_of(records, standard, kinds, steps).with_all()
     error = best.error
-    weights = restarted(best, finer, everything)
+    weights = _restarted(
+        best, windows_of(records, standard, kinds, steps, settings.samples), everything
+    )
     few = everything.used.sum() <= settings.samples
     last = settings.iterations if few else _LAST
     final = improved(best.form, everything, weights, settings.decay, last)
@@ -123,10 +134,7 @@ def _linear(
 ) -> dict[int, Candidate]:
     """Linear systems by the number of hidden states."""
     ny, nv = len(standard.outputs[0]), len(standard.inputs[0])
-    counts = range(settings.most + 1)
-    if settings.count is not None:
-        # One fewer tells whether the data can tell so many.
-        counts = range(max(0, settings.count - 1), settings.count + 1)
+    counts = range(settings.most + 1) if settings.count is None else [settings.count]
     found = subspace(records, standard, ny + max(counts))
     room = ny + max(counts)
     each = [linear_start(found, Form(ny + c, ny, nv, room=room), windows) for c in counts]
@@ -134,6 +142,66 @@ def _linear(
         margin = settings.stable * standard.step
         each = [contracting(c, margin) for c in each]
     return dict(zip(counts, each, strict=True))
+
+
+def _promising(linear: dict[int, Candidate]) -> list[int]:
+    """Numbers of hidden states from the least that a linear system is nearly as good with."""
+    least = min(c.error for c in linear.values())
+    first = min(c for c in linear if linear[c].error <= _NEARLY * least)
+    return [c for c in sorted(linear) if c >= first and np.isfinite(linear[c].error)]
+
+
+def _ascended(
+    linear: dict[int, Candidate], windows: Windows, settings: HiddenSettings, seed: int
+) -> tuple[Candidate, list[tuple[str, int, float]]]:
+    """The best of all, from few hidden states to more, until one more is not worth it.
+
+    What is nonlinear looks like further states to a linear system: it only tells where to begin.
+    """
+    best, tried = None, []
+    for count in _promising(linear):
+        candidates = list(_nonlinear(linear[count], windows, settings, seed))
+        tried += [(c.form.kind, count, c.error) for c in candidates]
+        # Where all run away, the linear one stays.
+        first = min([*candidates, linear[count]], key=lambda c: c.error)
+        if best is not None and first.error > _WORTH_A_STATE * best.error:
+            break
+        best = first
+    if best is None:
+        raise ValueError("no number of hidden states to try")
+    return best, tried
+
+
+def _nonlinear(
+    linear: Candidate, windows: Windows, settings: HiddenSettings, seed: int
+) -> Iterable[Candidate]:
+    """Candidates from one linear system, several at a time."""
+
+    def one(task: tuple[Form, int]) -> Candidate:
+        form, draw = task
+        weights = nonlinear_start(linear, form, draw)
+        found = improved(form, windows, weights, settings.decay, settings.iterations)
+        return replace(found, error=np.inf) if runs_away(found, windows) else found
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(one, _forms(linear.form, windows, settings, seed))
+
+
+def _forms(
+    base: Form, windows: Windows, settings: HiddenSettings, seed: int
+) -> list[tuple[Form, int]]:
+    """What is tried beside a linear form, the polynomial first, and the draw of each."""
+    if settings.form == "none":
+        return [(base, 0)]
+    forms: list[tuple[Form, int]] = []
+    there = windows.y[(windows.used + windows.left_out) > 0]
+    reach = max(REACH, _BEYOND * float(max(np.abs(there).max(), np.abs(windows.v).max())))
+    if settings.form in (None, "polynomial") and settings.stable is None:
+        forms.append((polynomial(base, settings.degree, _MOST_MONOMIALS, reach), 0))
+    if settings.form in (None, "tanh"):
+        tanh = replace(base, kind="tanh", units=settings.units, room=0)
+        forms += [(tanh, seed * settings.starts + k) for k in range(settings.starts)]
+    return forms
 
 
 def _interpolation(
@@ -151,8 +219,8 @@ def _interpolation(
     now, open_kinds = kinds
     if not any(open_kinds):
         return now, {}
-    windows = windows_of(records, standard, now, 1, settings.samples)
-    form = forms(linear.form, windows, settings, 0)[0][0]
+    at_hand = windows_of(records, standard, now, 1, settings.samples)
+    form = _forms(linear.form, at_hand, settings, 0)[0][0]
     start = nonlinear_start(linear, form, 0)
     tried: dict[str, tuple[Between, ...]] = {}
     errors: dict[str, float] = {}
@@ -186,3 +254,34 @@ def _steps(
         steps *= 2
         best = improved(best.form, finer, best.weights, settings.decay, _FOLLOW)
     return best, steps
+
+
+def _restarted(best: Candidate, few: Windows, everything: Windows) -> Array:
+    """The same parameters with states at the starts of all windows."""
+    form = best.form
+    if len(few.y) == len(everything.y):
+        return best.weights
+    n = form.states
+    starts = np.zeros((len(everything.y), n))
+    starts[:, : form.outputs] = everything.y[:, 0]
+    weights = np.concatenate([best.parameters, starts.ravel()])
+    return started(form, weights, everything.heads(_HEAD))
+
+
+def started(form: Form, weights: Array, windows: Windows, steps: int = 12) -> Array:
+    """Weights whose states at the starts of windows fit these best, by damped Gauss-Newton."""
+    error = HiddenError(form, windows)
+    p, n = form.size, form.states
+    before = error.cost(weights)
+    for _ in range(steps):
+        JtJ, Jtr = error.normal_equations(weights)
+        change = np.zeros_like(weights)
+        for i in range(len(windows.y)):
+            at = slice(p + n * i, p + n * (i + 1))
+            change[at] = -np.linalg.solve(JtJ[at, at] + 1e-3 * np.eye(n), Jtr[at])
+        trial = weights + np.clip(change, -2, 2)
+        after = error.cost(trial)
+        if not after < before * (1 - 1e-6):
+            break
+        weights, before = trial, after
+    return weights

@@ -28,8 +28,7 @@ class HiddenSettings:
     degree
         Of the polynomial; products of more than are worth it are left out.
     starts
-        Draws of the tanh units, of which the best on data left out is kept after a short lap, a
-        long one and a second one with other data left out.
+        Draws of the tanh units, of which the best on data left out is kept.
     iterations
         Largest number of Levenberg-Marquardt steps per start.
     startup
@@ -37,8 +36,8 @@ class HiddenSettings:
     samples
         Most samples that the search looks at; the last steps see all.
     decay
-        Weight of the squared parameters, in which one changes a rate by about its spread, beside
-        squared errors relative to what they are on average.
+        Weight of the squared parameters, in which one changes a rate by about its spread per
+        sample, beside squared errors relative to what they are on average.
     stable
         Where set, states of any two rollouts come together at this rate in 1/s at least, whatever
         is learned; for the form ``"tanh"`` or ``"none"``.
@@ -53,7 +52,7 @@ class HiddenSettings:
     iterations: int = 40
     startup: float | None = None
     samples: int = 6000
-    decay: float = 1.0
+    decay: float = 10.0
     stable: float | None = None
 
     def __post_init__(self) -> None:

@@ -25,8 +25,6 @@ _RIDGE = 1e-9
 _BEYOND = 1.6
 # Times that the weight of parameters follows the errors in the course of a search.
 _STAGES = 3
-# Samples that tell the state at the start of a window.
-_HEAD = 100
 
 
 @dataclass(frozen=True)
@@ -119,27 +117,11 @@ def rescaled(form: Form, weights: Array, paths: Array) -> Array:
     return np.concatenate([L.ravel(), starts.ravel()])
 
 
-class _Scaled:
-    """An error in weights relative to how far they are expected from zero: damped alike."""
-
-    def __init__(self, error: HiddenError, spreads: Array) -> None:
-        self._error, self._spreads = error, spreads
-
-    def cost(self, weights: Array) -> float:
-        return self._error.cost(self._spreads * weights)
-
-    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
-        JtJ, Jtr = self._error.normal_equations(self._spreads * weights)
-        return JtJ * np.outer(self._spreads, self._spreads), Jtr * self._spreads
-
-
 def improved(form: Form, windows: Windows, weights: Array, decay: float, limit: int) -> Candidate:
     """Step so many times, and take those of the second half that meets data left out best.
 
     Data left out judge, and do not end a search early: in a short record they hold events that no
-    other part of it does, and errors there rise before they fall. How far a parameter is expected
-    from zero follows from how fast the states are, so that a record sampled twice as often is
-    fitted alike.
+    other part of it does, and errors there rise before they fall.
     """
     error = HiddenError(form, windows)
     judged = bool(windows.left_out.any())
@@ -147,16 +129,13 @@ def improved(form: Form, windows: Windows, weights: Array, decay: float, limit: 
     def on_left_out(weights: Array) -> float:
         return error.left_out(weights) if judged else error.trained(weights)
 
-    spreads = np.ones(error.size)
-    spreads[: form.size] = form.spreads(error.rates(weights))
     best, least, taken, last = weights, np.inf, 0, weights
     stage, count = -(-limit // _STAGES), 0
     for _ in range(_STAGES):
         # What the errors are decides what a parameter of one may cost.
-        prior = decay * error.trained(last) / spreads[: form.size] ** 2
-        weighed = _Scaled(HiddenError(form, windows, prior), spreads)
-        for step in islice(LevenbergMarquardt(weighed, Step(last / spreads), 0.0), stage):
-            count, last = count + 1, step.weights * spreads
+        weighed = HiddenError(form, windows, decay * error.trained(last))
+        for step in islice(LevenbergMarquardt(weighed, Step(last), 0.0), stage):
+            count, last = count + 1, step.weights
             if 2 * count >= limit and (now := on_left_out(last)) <= least:
                 best, least, taken = last, now, count
     if not np.isfinite(least):
@@ -218,34 +197,3 @@ def contracting(linear: Candidate, margin: float) -> Candidate:
     stable = replace(form, metric=tuple(map(tuple, P.tolist())), margin=margin, room=0)
     weights = np.concatenate([np.concatenate([M, rest], axis=1).ravel(), starts.ravel()])
     return Candidate(stable, weights, linear.error, linear.steps)
-
-
-def restarted(best: Candidate, few: Windows, everything: Windows) -> Array:
-    """The same parameters with states at the starts of all windows."""
-    form = best.form
-    if len(few.y) == len(everything.y):
-        return best.weights
-    n = form.states
-    starts = np.zeros((len(everything.y), n))
-    starts[:, : form.outputs] = everything.y[:, 0]
-    weights = np.concatenate([best.parameters, starts.ravel()])
-    return started(form, weights, everything.heads(_HEAD))
-
-
-def started(form: Form, weights: Array, windows: Windows, steps: int = 12) -> Array:
-    """Weights whose states at the starts of windows fit these best, by damped Gauss-Newton."""
-    error = HiddenError(form, windows)
-    p, n = form.size, form.states
-    before = error.cost(weights)
-    for _ in range(steps):
-        JtJ, Jtr = error.normal_equations(weights)
-        change = np.zeros_like(weights)
-        for i in range(len(windows.y)):
-            at = slice(p + n * i, p + n * (i + 1))
-            change[at] = -np.linalg.solve(JtJ[at, at] + 1e-3 * np.eye(n), Jtr[at])
-        trial = weights + np.clip(change, -2, 2)
-        after = error.cost(trial)
-        if not after < before * (1 - 1e-6):
-            break
-        weights, before = trial, after
-    return weights

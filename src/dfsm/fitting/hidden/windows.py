@@ -72,14 +72,6 @@ class Windows:
             self, **cut, **{n: getattr(self, n)[:, :samples] for n in ("y", "used", "left_out")}
         )
 
-    def turned(self) -> Windows:
-        """The same with other stretches left out, those half a round later."""
-        inside = (self.used + self.left_out) > 0
-        judged = np.zeros_like(self.used)
-        for row, here in zip(judged, inside, strict=True):
-            row[here] = _judged(int(here.sum()), len(self.y), turn=0.5)
-        return replace(self, used=inside - judged, left_out=judged)
-
 
 _FIELDS = ("y", "h", "v", "used", "left_out", "first")
 
@@ -153,12 +145,12 @@ def _edges(samples: int, length: int) -> Array:
     return np.linspace(0, samples - 1, pieces + 1).round().astype(int)
 
 
-def _judged(samples: int, windows: int, turn: float = 0.0) -> Array:
+def _judged(samples: int, windows: int) -> Array:
     """Which samples of a window are left out: some stretches of a long one, the ends of many."""
     at = np.arange(samples) / samples
     if windows > _FEW:
-        return ((at + turn) % 1 >= 1 - _LEFT_OUT).astype(float)
-    return ((at * _PLACES + turn) % 1 >= 1 - _LEFT_OUT).astype(float)
+        return (at >= 1 - _LEFT_OUT).astype(float)
+    return (at * _PLACES % 1 >= 1 - _LEFT_OUT).astype(float)
 
 
 def _stages(
