@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -189,6 +188,10 @@ class Config(Strict):
         given = self.signals.parameters
         return tuple(given if isinstance(given, list) else names_in(self._parameters()))
 
+    def kept(self, run: Trajectory) -> Trajectory:
+        """A run without the channels that a fit never reads."""
+        return only_read(run, self.fit_settings(), elsewhere=names_in(self._parameters()))
+
     def with_parameters(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
         """Runs with the parameters that the configuration gives."""
         return with_parameters(runs, self._parameters())
@@ -228,7 +231,7 @@ def load_config(path: str | Path, *, whole: bool = True) -> tuple[Config, list[T
         _check_together(config)
     except DfsmError as error:
         raise DfsmError(f"{path}: {error}") from None
-    keep = None if whole else partial(only_read, settings=config.fit_settings())
+    keep = None if whole else config.kept
     runs = read_all(config.data.train, path.parent, config.data.step, keep)
     return config, config.with_parameters(runs)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,15 +154,18 @@ class Samples:
             yield slice(start, stop)
 
 
-def only_read(run: Trajectory, settings: FitSettings) -> Trajectory:
+def only_read(
+    run: Trajectory, settings: FitSettings, elsewhere: Collection[str] = ()
+) -> Trajectory:
     """A run without the channels that a fit never reads, so that many fit into memory.
 
-    The run itself where a channel that the fit needs is not there, for what else it has is told
-    then, and where channels of two rates are filled, which ends the run where the first does.
+    `elsewhere` are parameters whose values a configuration holds. The run itself where a channel
+    that the fit needs is not there, for what else it has is told then, and where channels of two
+    rates are filled, which ends the run where the first does.
     """
     names = dict.fromkeys(settings.roles)
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
-    computed = {f.name for f in settings.features} | set(settings.parameters)
+    computed = {f.name for f in settings.features} | set(elsewhere)
     if settings.azimuth is not None:
         angle = settings.azimuth.angle
         names.update(dict.fromkeys((*settings.azimuth.field, *([] if angle is None else [angle]))))

@@ -32,10 +32,11 @@ def schedule_gaps(samples: Samples, model: LinearModel) -> list[str]:
     Returns
     -------
     list of str
-        One sentence per gap; none without a schedule, or if one run sweeps it.
+        One sentence per gap; none without a schedule, or if one run sweeps it, or where it is a
+        parameter, whose values are the user's choice.
     """
-    column = model.schedule
-    if column is None or len(model.grid) < 2:
+    column, parameters = model.schedule, samples.signals.order.columns("parameters")
+    if column is None or column >= parameters.start or len(model.grid) < 2:
         return []
     spacing = float(np.diff(np.asarray(model.grid)).mean())
     values, operating = samples.inputs[:, column], list[tuple[float, float]]()
