@@ -107,7 +107,8 @@ def test_what_the_functions_take_is_told(functions, tmp_path):
     f, g, told, turned = file.unpack(), file.unpack(), json.loads(file.unpack()), file.unpack()
     assert f.name_in() == ["states", "controls", "disturbances", "parameters"]
     assert (g.name_out(), turned.name_in()[4:]) == (["outputs"], ["azimuth", "field"])
-    assert told["states"][1] == {"name": "heave <z>", "unit": "m", "start": 0.0}
+    heave = {"name": "heave <z>", "unit": "m", "start": 0.0, "trained": [-2.0, 2.0]}
+    assert told["states"][1] == heave
     assert [c["between_samples"] for c in told["controls"]] == ["hold", "linear"]
     assert told["computed_inputs"] == ["eta_dot (m/s) is the time derivative of eta: supply it"]
     # Latent states start where the inputs hold them: their row of f̂ is zero.

@@ -122,7 +122,7 @@ def test_the_score_is_that_of_validate(runs, tmp_path):
 
 
 def test_one_that_diverges_comes_after_all_that_do_not(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("dfsm.simulation.simulate.ESCAPE", 1.5)
+    monkeypatch.setattr("dfsm.simulation.outcome.ESCAPE", 1.5)
     candidates = {"q": variant(states=(StateSpec(name="q"),)), "true": LINEAR}
     found = compare(candidates, runs, tmp_path / "c", validation=runs[:2], jobs=1)
     assert [c.status for c in found.candidates] == ["completed", "diverged"]

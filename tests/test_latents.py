@@ -337,7 +337,6 @@ def test_staying_inside_does_not_bind_what_only_disturbances_drive(by_wind):
     assert solve(problem, method, simulate=False).solved
 
 
-# The system has hidden states indeed.
 @pytest.mark.filterwarnings("ignore:derivatives are not to be fitted here:dfsm.errors.DfsmWarning")
 @pytest.mark.parametrize(("linear", "latents"), [(LTI(), 0), (LPV(schedule="w", points=3), 2)])
 def test_known_coefficients(runs, linear, latents, tmp_path):

@@ -94,7 +94,7 @@ def test_pages_that_the_code_names_exist():
     named = {
         n for p in code for n in re.findall(r"docs/[\w/-]+\.md", p.read_text(encoding="utf-8"))
     }
-    assert "docs/how-to/problem.md" in named
+    assert "docs/hidden-states.md" in named
     assert {n for n in named if n not in PAGES} == set()
 
 

@@ -37,7 +37,7 @@ from dfsm.simulation.loop_cases import (
     padded,
     prepared_cases,
 )
-from dfsm.simulation.simulate import ESCAPE, MUCH_OUTSIDE
+from dfsm.simulation.outcome import ESCAPE, MUCH_OUTSIDE
 from dfsm.simulation.wires import Wires, connect, not_commanded
 
 

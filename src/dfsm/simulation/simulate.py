@@ -29,12 +29,10 @@ from dfsm.simulation.fastest import REACH, fastest_rates
 from dfsm.simulation.hidden import latents_from_past, told_state
 from dfsm.simulation.integrate import Case, Drive, Rollout, adapt, mesh_of, pieces_of
 from dfsm.simulation.march import march
-from dfsm.simulation.outcome import ESCAPE, MUCH_OUTSIDE, Simulation, Status, judge, tell
+from dfsm.simulation.outcome import Simulation, Status, judge, tell
 
 __all__ = [
-    "ESCAPE",
     "METHODS",
-    "MUCH_OUTSIDE",
     "Method",
     "Simulation",
     "SimulationSettings",

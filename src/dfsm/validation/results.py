@@ -17,7 +17,7 @@ from dfsm.models.departures import told
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.spectra import Spectrum
 from dfsm.numerics.time_mesh import mean_over, std_over
-from dfsm.simulation.simulate import MUCH_OUTSIDE, Simulation, Status
+from dfsm.simulation.outcome import MUCH_OUTSIDE, Simulation, Status
 from dfsm.validation.intervals import Intervals
 
 if TYPE_CHECKING:
