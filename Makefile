@@ -37,7 +37,7 @@ style: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/.installed-dev
-	$(BIN)/basedpyright
+	$(BIN)/basedpyright --threads 2
 
 contracts: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
