@@ -42,8 +42,9 @@ CONFIG: dict[str, Any] = {
 
 # Files that take longest; workers take them first, so that none is left alone with one at the end.
 LONG = (
-    *("test_results", "test_parameter_study", "test_studies", "test_turbine_control"),
-    *("test_latents", "test_adaptive", "test_refine", "test_control_problems"),
+    *("test_results", "test_robot_results", "test_parameter_study", "test_studies"),
+    *("test_turbine_control", "test_latents", "test_adaptive", "test_refine"),
+    *("test_control_problems",),
 )
 
 # What was compiled for one worker, for a process that a test starts, or in an earlier run, is not
