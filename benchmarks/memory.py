@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import struct
-import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from benchmarks.process import usage
 from benchmarks.startup import ROOT
 from dfsm.core.types import Array
 
@@ -59,20 +59,9 @@ def run() -> dict[str, Any]:
 def peak(place: Path, command: Sequence[str]) -> float:
     """Highest resident memory in MB of one command in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dfsm", *command],
-        cwd=place,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-    told = process.stderr.read() if process.stderr is not None else b""
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise RuntimeError(f"dfsm {' '.join(command)}: {told.decode(errors='replace')}")
+    used = usage(place, command, environment)
     # Linux tells KiB, macOS bytes.
-    return usage.ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
+    return used.ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
 
 
 def memory_table(figures: Mapping[str, float]) -> list[str]:

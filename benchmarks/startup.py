@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from benchmarks.process import usage
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "examples" / "iea15"
@@ -102,19 +103,8 @@ def seconds(place: Path, build: Path, command: Sequence[str], cache: str) -> flo
     """Processor time, user and system, of one command in a process of its own."""
     own = {k: v for k, v in os.environ.items() if not k.startswith(_SETTINGS)}
     environment = own | {"PYTHONPATH": str(build / "src"), "DFSM_CACHE": cache}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dfsm", *command],
-        cwd=place,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-    told = process.stderr.read() if process.stderr is not None else b""
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in _FINE:
-        raise RuntimeError(f"dfsm {' '.join(command)}: {told.decode(errors='replace')}")
-    return usage.ru_utime + usage.ru_stime
+    used = usage(place, command, environment, _FINE)
+    return used.ru_utime + used.ru_stime
 
 
 @contextmanager
