@@ -20,6 +20,7 @@ from benchmarks.accuracy import demo, neighbour
 from benchmarks.twins import TWINS
 from dfsm.demos.two_link_robot.multi_fidelity import fit_settings
 from dfsm.errors import hushed
+from dfsm.numerics.hats import hat_weights
 from dfsm.selection.left_out import left_out_errors
 from dfsm.simulators.excitation import RandomKnots, Uniform
 from dfsm.validation.calibrate import intervals_of
@@ -86,9 +87,9 @@ def _constant(grid: np.ndarray, parts: Sequence[RolloutErrors]) -> np.ndarray:
     parts = [p for p in parts if p.group.startswith("run ")]
     squares = np.concatenate([p.errors for p in parts]) ** 2
     at = np.concatenate([p.schedule for p in parts])
-    hats = np.stack([np.interp(at, grid, row) for row in np.eye(len(grid))])
+    hats = hat_weights(grid, at)
     mean = squares.mean(axis=0)
-    scale = np.sqrt((hats @ squares + mean) / (hats.sum(axis=1) + 1)[:, None])
+    scale = np.sqrt((hats.T @ squares + mean) / (hats.sum(axis=0) + 1)[:, None])
     expected = np.stack([np.interp(at, grid, s) for s in scale.T], axis=1)
     return np.quantile(np.sqrt(squares) / expected, LEVEL, axis=0) * scale
 

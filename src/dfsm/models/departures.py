@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel
 from dfsm.models.region import Region
-from dfsm.numerics.hats import hats
+from dfsm.numerics.hats import hat_weights
 from dfsm.numerics.time_mesh import mean_over
 
 # Standard deviation of a constant, over its size: rounding.
@@ -95,7 +94,9 @@ def departures(
     together = outside & ~beyond.any(axis=1)
     if together.any():
         rows, share, first = _when(together, time, weights)
-        found.append(_together(region, channels, inputs[rows], (share, first)))
+        # Of the whole path: its length is common to many runs, and compiled once.
+        farthest = float(np.sqrt(np.asarray(region.distance(inputs))[rows].max()))
+        found.append(_together(region, channels, inputs[rows], farthest, (share, first)))
     return tuple(sorted(found, key=lambda d: (not d.constant, -d.share)))
 
 
@@ -131,11 +132,15 @@ def _beyond(
 
 
 def _together(
-    region: Region, channels: Sequence[Channel], inputs: Array, when: tuple[float, float]
+    region: Region,
+    channels: Sequence[Channel],
+    inputs: Array,
+    farthest: float,
+    when: tuple[float, float],
 ) -> Departure:
     """Signals that make up most of the distance where each is inside its own range."""
     part = inputs[np.linspace(0, len(inputs) - 1, min(len(inputs), _LOOKED_AT)).astype(int)]
-    shares = np.asarray(hats(region.grid, jnp.asarray(part[:, region.schedule or 0])))
+    shares = hat_weights(np.asarray(region.grid), part[:, region.schedule or 0])
     W, middles = np.asarray(region.whitening), np.asarray(region.operating)
     apart = part[:, None] - middles
     # What each signal adds to the squared distance; all together make it up.
@@ -144,7 +149,6 @@ def _together(
     order = np.argsort(-added).tolist()
     alike = [k for k in order[:_TOGETHER] if added[k] >= _ALIKE * added[order[0]]]
     names = tuple(channels[k].name for k in (alike if len(alike) > 1 else order[:2]))
-    farthest = float(np.sqrt(np.max(np.asarray(region.distance(inputs)))))
     listed = " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
     what = (
         f"{listed} are each inside their range but go together as in no training run "

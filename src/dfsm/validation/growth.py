@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 
 from dfsm.core.types import Array
+from dfsm.numerics.hats import hat_weights
 
 # Lags at which the growth is known: this many, each half of the next, up to the longest rollout.
 _LAGS = 9
@@ -114,7 +115,7 @@ class Growth:
         )
 
     def _along(self, lag: Array) -> Array:
-        inside = _hats(_octaves(lag), _octaves(self.lag)) @ self.along
+        inside = hat_weights(_octaves(self.lag), _octaves(lag)) @ self.along
         last = self.lag[-1]
         if lag[-1] <= last * (1 + 1e-6):
             return inside
@@ -158,7 +159,7 @@ class Law:
 
     def at(self, part: RolloutErrors) -> Array:
         """Root mean square error that is expected along a rollout, ``(time, channel)``."""
-        return (_hats(part.schedule, self.grid) @ self.scale) * self.growth.factor(
+        return (hat_weights(self.grid, part.schedule) @ self.scale) * self.growth.factor(
             part.lag, part.distance
         )
 
@@ -212,8 +213,8 @@ class _Likeliest:
         self.size = np.sqrt(np.maximum(squares.mean(axis=0), np.finfo(float).tiny))
         self.squares = squares / self.size**2
         self.farthest = float(distance.max())
-        self.points = _hats(schedule, grid)
-        self.lags = _hats(_octaves(lag), _octaves(self.lag))
+        self.points = hat_weights(grid, schedule)
+        self.lags = hat_weights(_octaves(self.lag), _octaves(lag))
         # Log of what the distance multiplies squared errors by, for every power.
         self.far = 2 * _far(distance, knee)[:, None] * _POWERS
         self.near = np.exp(-self.far)
@@ -260,17 +261,6 @@ def _octaves(lag: Array) -> Array:
     return np.log2(np.maximum(lag, np.finfo(float).tiny))
 
 
-def _hats(values: Array, grid: Array) -> Array:
-    """Weight of every grid point at values, ``(value, point)``; the ends are held."""
-    return np.stack([np.interp(values, grid, row) for row in np.eye(len(grid))], axis=1)
-
-
 def _rising(values: Array, weights: Array) -> Array:
-    """The nearest sequence that never falls (pool adjacent violators)."""
-    blocks: list[list[float]] = []
-    for value, weight in zip(values.tolist(), weights.tolist(), strict=True):
-        blocks.append([value, max(weight, 1e-9), 1])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            (a, wa, na), (b, wb, nb) = blocks[-2], blocks.pop()
-            blocks[-1] = [(a * wa + b * wb) / (wa + wb), wa + wb, na + nb]
-    return np.concatenate([np.full(int(n), value) for value, _, n in blocks])
+    """The nearest sequence that never falls."""
+    return scipy.optimize.isotonic_regression(values, weights=np.maximum(weights, 1e-9)).x
