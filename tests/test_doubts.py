@@ -290,9 +290,8 @@ def test_an_input_that_is_held_and_new_at_every_sample_is_told():
         held[k + 1] = decay * held[k] + (1 - decay) * u[k]
         step = u[k + 1] - u[k]
         lines[k + 1] = decay * lines[k] + (1 - decay) * u[k] + ramp * step
-    runs = np.zeros(800, dtype=int)
-    assert held_unseen(held[:, None], u[:, None], runs) == [0]
-    assert held_unseen(lines[:, None], u[:, None], runs) == []
+    assert held_unseen(lambda: [(held[:, None], u[:, None])]) == [0]
+    assert held_unseen(lambda: [(lines[:, None], u[:, None])]) == []
     _, notes = told([run(np.arange(800.0), x=held, u=u)])
     assert any("set inputs: {u: hold}" in note for note in notes)
     chosen = fit([run(np.arange(800.0), x=held, u=u)], replace(SETTINGS, inputs="hold")).model

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr  # pyright: ignore[reportMissingImports]
 
-
 __all__ = ["Channel", "Role", "Trajectory", "labels"]
 
 
@@ -206,18 +205,22 @@ class Trajectory(Drawn):
         hi = np.inf if stop is None else stop + slack
         if start is not None and stop is not None and start >= stop:
             raise DfsmError(f"the time window goes from {start:g} s to {stop:g} s: swap the two")
-        if (keep := (self.time >= lo) & (self.time <= hi)).sum() < 2:
+        first, end = np.searchsorted(self.time, lo), np.searchsorted(self.time, hi, "right")
+        if end - first < 2:
             raise DfsmError(
                 f"{self.where}: runs from {self.time[0]:g} s to {self.time[-1]:g} s, shorter than "
                 f"the time window asked for ({start if start is not None else '…'} to "
                 f"{stop if stop is not None else '…'} s): change the window or leave the run out"
             )
-        if keep.all():
-            return self._part()
-        time, wall = self.time[keep], self.wall_time
-        if wall is not None:
-            wall = wall * (float(time[-1] - time[0]) / self.duration)
-        return self._part(time=time, values=self.values[keep], wall_time=wall)
+        time, values = self.time[first:end], self.values[first:end]
+        if 2 * len(time) < len(self):  # a small part must not keep all of a run in memory
+            time, values = time.copy(), values.copy(order="K")
+        wall = self.wall_time and self.wall_time * (float(time[-1] - time[0]) / self.duration)
+        return self._part(time=time, values=values, wall_time=wall)
+
+    def on_time_of(self, other: Trajectory) -> Trajectory:
+        """Share the other's array of times where both are equal: many runs then hold one."""
+        return self._part(time=other.time) if np.array_equal(self.time, other.time) else self
 
     def _part(self, **changes: Any) -> Trajectory:
         """Replace fields by parts of what is here, neither copied nor checked once more."""

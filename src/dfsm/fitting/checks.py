@@ -13,7 +13,8 @@ from dfsm.data.dataset import Dataset
 from dfsm.errors import DfsmError, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.doubts import Doubts
-from dfsm.fitting.samples import Samples, data_warnings, held_records
+from dfsm.fitting.records import data_warnings, held_records
+from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.verdicts import Evidence, verdicts
 from dfsm.models.dfsm import DFSM
@@ -24,7 +25,7 @@ from dfsm.simulation.simulate import Status, simulate
 # rollouts from different initial states are followed.
 _CHECK_RUNS, _PAIRED_RUNS = 8, 3
 # Samples at which a model is evaluated together.
-_TOGETHER = 2**18
+_TOGETHER = 2**16
 
 
 def check(

@@ -165,19 +165,19 @@ def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array,
     """Inputs, what the fit leaves, and the runs, every sample standing for the same time."""
     if samples.weights is None:
         return inputs, left, samples.runs
-    table, parts, runs = np.column_stack([inputs, left]), list[Array](), list[IntArray]()
-    numbers = np.unique(samples.runs)
-    whole = [np.ptp(samples.time[samples.runs == k]) for k in numbers]
-    step = sum(whole) / len(table)
-    for k, length in zip(numbers, whole, strict=True):
-        inside = samples.runs == k
-        time = samples.time[inside]
-        even = np.linspace(time[0], time[-1], max(2, round(length / step)))
-        parts.append(np.stack([np.interp(even, time, c) for c in table[inside].T], axis=1))
-        runs.append(np.full(len(even), k))
-    together = np.concatenate(parts)
-    count = inputs.shape[1]
-    return together[:, :count], together[:, count:], np.concatenate(runs)
+    lengths = [np.ptp(time) for time in samples.times]
+    step = sum(lengths) / len(inputs)
+    counts = [max(2, round(length / step)) for length in lengths]
+    both = inputs, left
+    even = tuple[Array, Array](np.empty((sum(counts), part.shape[1])) for part in both)
+    begin = 0
+    for time, count, rows in zip(samples.times, counts, samples.parts, strict=True):
+        mesh = np.linspace(time[0], time[-1], count)
+        for part, own in zip(both, even, strict=True):
+            for column, values in enumerate(part[rows].T):
+                own[begin : begin + count, column] = np.interp(mesh, time, values)
+        begin += count
+    return even[0], even[1], np.repeat(np.arange(len(counts)), counts)
 
 
 def _feedback(

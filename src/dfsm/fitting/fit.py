@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from dfsm.core.hand_back import hand_back
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
@@ -30,7 +31,7 @@ from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
-from dfsm.fitting.gate import correct, predict, predicted
+from dfsm.fitting.gate import correct, left_over, predicted
 from dfsm.fitting.hidden.advice import hidden_advice
 from dfsm.fitting.hidden.build import fit_hidden, require_hidden
 from dfsm.fitting.known import known_coefficients
@@ -123,9 +124,9 @@ def fit(
         rows, samples = over_intervals(samples, lambda rows: _fit_slopes(rows, settings))
         f = _fit_derivatives(rows, settings)
     with _timed(seconds, "doubts"):
-        residuals = predict(f.model, rows, rows.linear_inputs, rows.derivatives)
-        np.subtract(rows.derivatives, residuals, out=residuals)
-        doubt = doubts(rows, f, residuals, settings, intervals=rows is not samples)
+        left = left_over(f.model, rows, rows.linear_inputs, rows.derivatives)
+        doubt = doubts(rows, f, left, settings, intervals=rows is not samples)
+        del left
     with _timed(seconds, "corrective functions"):
         later = hidden is not None or (refinement is not None and refinement.network > 0)
         e = correct(rows, rows.linear_inputs, rows.derivatives, f, settings, later)
@@ -227,8 +228,8 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     kinematic = kinematic_rows(settings.states)
     fitted = [i for i in range(samples.derivatives.shape[1]) if i not in kinematic]
     known = known_coefficients(samples, settings, fitted)
-    inputs, targets = samples.linear_inputs, samples.derivatives[:, fitted]
-    result = _linear(samples, inputs, targets, settings, {**known.first, **known.fixed})
+    inputs, first = samples.linear_inputs, {**known.first, **known.fixed}
+    result = _linear(samples, inputs, samples.derivatives, settings, fitted, first)
     result = replace(result, model=replace(result.model, known=tuple(known.fixed)))
     columns = samples.signals.state_columns
     if settings.linear.margin is not None:
@@ -311,7 +312,8 @@ def _account(
 def _fit_outputs(samples: Samples, settings: FitSettings) -> LinearFit | None:
     if not settings.outputs:
         return None
-    return _linear(samples, samples.output_inputs, samples.outputs, settings)
+    every = range(samples.outputs.shape[1])
+    return _linear(samples, samples.output_inputs, samples.outputs, settings, every)
 
 
 def _slopes(samples: Samples, fit: LinearFit) -> Array:
@@ -328,6 +330,7 @@ def _linear(
     inputs: Array,
     targets: Array,
     settings: FitSettings,
+    rows: Sequence[int],
     known: Mapping[tuple[int, int], float] | None = None,
 ) -> LinearFit:
     names = samples.linear_names
@@ -341,7 +344,7 @@ def _linear(
             )
         column = names.index(settings.linear.schedule)
         windows = schedule_windows(inputs[:, column], settings.linear.points, samples.weights)
-    blocks = samples.weighted_blocks(inputs, targets)
+    blocks = samples.weighted_blocks(inputs, targets, rows)
     return fit_linear(blocks, names, settings.linear, windows, known)
 
 
@@ -441,4 +444,5 @@ def _record(
 def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
     begin = clock.perf_counter()
     yield
+    hand_back()
     seconds[step] = clock.perf_counter() - begin

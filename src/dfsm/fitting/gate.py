@@ -19,7 +19,7 @@ from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.corrective import Corrective
 from dfsm.models.linear import LinearModel
-from dfsm.numerics.time_mesh import mean_over, std_over
+from dfsm.numerics.time_mesh import mean_over, rms_over, std_over
 
 # A correction is kept if it explains at least this share of the residual's variance on runs left
 # out of training. Less than that is within what cross-validation finds in noise, and may undo what
@@ -82,8 +82,8 @@ def correct(
     -------
     Correction
     """
-    residuals = targets - predict(linear.model, samples, inputs, targets)
-    rms = np.sqrt(mean_over(residuals**2, samples.weights))
+    residuals = left_over(linear.model, samples, inputs, targets)
+    rms = rms_over(residuals, samples.weights)
     std = std_over(targets, samples.weights)
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     derivatives = targets is samples.derivatives
@@ -160,9 +160,12 @@ def _train(
     return fit_corrective(seen, residuals, runs, settings.corrective, settings.seed, weights)
 
 
-def predict(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
-    """The linear fit of some targets ``(sample, target)``, run by run to bound memory."""
-    return np.concatenate([predicted(model, b) for b, _ in samples.blocks(inputs, targets)])
+def left_over(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """What a linear fit leaves of its targets ``(sample, target)``, run by run."""
+    residuals = np.empty_like(targets)
+    for rows in samples.parts:
+        residuals[rows] = targets[rows] - predicted(model, inputs[rows])
+    return residuals
 
 
 def predicted(model: LinearModel, inputs: Array) -> Array:

@@ -7,6 +7,8 @@ samples before them and on the inputs before, now and then: a held input has no 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+
 import numpy as np
 
 from dfsm.core.types import Array, IntArray
@@ -19,43 +21,71 @@ _NONE = 0.1
 _FEWEST = 10
 
 
-def held_unseen(states: Array, inputs: Array, runs: IntArray) -> list[int]:
+def held_unseen(runs: Callable[[], Iterable[tuple[Array, Array]]]) -> list[int]:
     """Columns of the inputs that act as held ones.
 
     Parameters
     ----------
-    states, inputs
-        Equidistant samples, ``(sample, state)`` and ``(sample, input)``.
     runs
-        Run of every sample.
+        Equidistant samples of the states and of the inputs of every run, ``(sample, state)`` and
+        ``(sample, input)``; called for each pass over them, which holds one run at a time.
     """
-    within = runs[2:] == runs[:-2]
-    bends = np.array([np.sqrt(np.mean(np.diff(v, 2)[within] ** 2)) for v in inputs.T])
-    spread = np.array([v.std() for v in inputs.T])
+    bends, spread = _bends_and_spread(inputs for _, inputs in runs())
     columns = np.flatnonzero((bends > _ROUGH * spread) & (spread > 0))
-    rows = np.flatnonzero(runs[2:] == runs[:-2]) + 1
-    count = len(columns)
-    width = 2 * states.shape[1] + 2 * inputs.shape[1] + count + 1
-    if not count or len(rows) < _FEWEST * width:
+    if not len(columns):
         return []
-    now, then = inputs[rows][:, columns], inputs[rows + 1][:, columns]
-    rest = np.delete(inputs, columns, axis=1)
-    past = [states[rows], states[rows - 1], inputs[rows - 1], rest[rows], rest[rows + 1]]
-    X = np.column_stack([then, now, *past, np.ones(len(rows))])
-    X, y = X / np.maximum(np.abs(X).max(axis=0), np.finfo(float).tiny), states[rows + 1]
-    inverse = np.linalg.pinv(X.T @ X, hermitian=True)
-    effects = inverse @ (X.T @ y)
-    left = np.mean((y - X @ effects) ** 2, axis=0)
+    count, largest = 0, np.zeros(0)
+    for X, _ in _before_and_after(runs(), columns):
+        most = np.abs(X).max(axis=0)
+        largest, count = np.maximum(largest, most) if count else most, count + len(X)
+    if count < _FEWEST * len(largest):
+        return []
+    largest = np.maximum(largest, np.finfo(float).tiny)
+    products, with_next = 0.0, 0.0
+    for X, y in _before_and_after(runs(), columns):
+        products, with_next = products + (X / largest).T @ (X / largest), with_next + X.T @ y
+    inverse = np.linalg.pinv(products, hermitian=True)
+    effects = inverse @ (with_next / largest[:, None])
+    squares = [
+        np.sum((y - X / largest @ effects) ** 2, axis=0)
+        for X, y in _before_and_after(runs(), columns)
+    ]
     # Bounded below: of a fit without residual the rounding decides.
+    left = np.sum(squares, axis=0) / count
     errors = np.sqrt(np.maximum(np.outer(np.diag(inverse), left), 0.0))
-    found = []
+    found, after = [], len(columns)
     for k, column in enumerate(columns.tolist()):
-        best = int(np.argmax(np.abs(effects[count + k]) / np.maximum(errors[count + k], 1e-300)))
-        most = np.abs(effects[count + k, best])
+        now = after + k
+        best = int(np.argmax(np.abs(effects[now]) / np.maximum(errors[now], 1e-300)))
+        most = np.abs(effects[now, best])
         later = np.abs(effects[k, best]) + 2 * errors[k, best]
-        if later < _NONE * most and 2 * errors[count + k, best] < _NONE * most:
+        if later < _NONE * most and 2 * errors[now, best] < _NONE * most:
             found.append(column)
     return found
+
+
+def _bends_and_spread(runs: Iterable[Array]) -> tuple[Array, Array]:
+    """Root mean squares of second differences and standard deviations, ``(input,)``, over runs."""
+    figures = [
+        (len(v), v.mean(axis=0), v.var(axis=0), np.sum(np.diff(v, 2, axis=0) ** 2, axis=0))
+        for v in runs
+    ]
+    counts, means, variances, squares = (np.array(part) for part in zip(*figures, strict=True))
+    share = counts / counts.sum()
+    variance = share @ (variances + (means - share @ means) ** 2)
+    return np.sqrt(squares.sum(axis=0) / max(np.sum(counts - 2), 1)), np.sqrt(variance)
+
+
+def _before_and_after(
+    runs: Iterable[tuple[Array, Array]], columns: IntArray
+) -> Iterator[tuple[Array, Array]]:
+    """What may act on the next state, "then" and "now" first, and that state, run by run."""
+    for states, inputs in runs:
+        if len(inputs) < 3:
+            continue
+        x, u, rest = states[1:-1], inputs[1:-1], np.delete(inputs, columns, axis=1)
+        past = [x, states[:-2], inputs[:-2], rest[1:-1], rest[2:], np.ones(len(x))]
+        yield np.column_stack([inputs[2:, columns], u[:, columns], *past]), states[2:]
 
 
 def held_note(name: str) -> str:

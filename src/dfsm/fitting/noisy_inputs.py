@@ -9,10 +9,13 @@ only where the derivative does not follow it as the fit says.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
-from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
+from dfsm.numerics.time_mesh import std_over
 
 # Share of an input's own variance from which noise is told, and share of the fitted effect below
 # which its fast part has none.
@@ -43,36 +46,58 @@ def noise_shares(inputs: Array, target: Array, runs: IntArray, row: Array) -> Ar
     shares = np.zeros(inputs.shape[1])
     if len(inputs) < _FEWEST:
         return shares
-    own = _partial_variance(inputs)
-    within = np.diff(runs) == 0
-    noise = np.array([_white(column, within) for column in inputs.T])
+    ends = [0, *(np.flatnonzero(np.diff(runs)) + 1).tolist(), len(runs)]
+    parts = [slice(start, stop) for start, stop in pairwise(ends)]
+    own = _partial_variance(inputs, parts)
+    noise = np.array([_white(column, parts) for column in inputs.T])
     share = noise / np.maximum(own, np.finfo(float).tiny)
     if not ((share > _SHARE) & (share < 1)).any():
         return shares
-    fast = np.diff(np.column_stack([inputs, target]), n=2, axis=0)[within[1:] & within[:-1]]
-    fast = fast - fast.mean(axis=0)
-    spread = np.maximum(fast.std(axis=0)[:-1], np.finfo(float).tiny)
-    effect = np.linalg.lstsq(fast[:, :-1] / spread, fast[:, -1], rcond=1e-10)[0] / spread
+    effect = _effect_of_fast_parts(inputs, target, parts)
     silent = np.abs(effect) < _NO_EFFECT * np.abs(row)
     told = (share > _SHARE) & (share < 1) & silent
     shares[told] = share[told]
     return shares
 
 
-def _white(values: Array, within: NDArray[np.bool_]) -> float:
+def _effect_of_fast_parts(inputs: Array, target: Array, parts: Sequence[slice]) -> Array:
+    """Coefficients of the target's second differences on those of the inputs, ``(input,)``."""
+    table = np.zeros((0, inputs.shape[1] + 1))
+    mean, count = np.zeros(table.shape[1]), 0
+    for centred in (False, True):
+        for rows in parts:
+            fast = np.diff(np.column_stack([inputs[rows], target[rows]]), n=2, axis=0)
+            if centred:  # the triangle of all rows so far tells the same as they do
+                table = np.asarray(np.linalg.qr(np.concatenate([table, fast - mean]), mode="r"))
+            else:
+                mean, count = mean + fast.sum(axis=0), count + len(fast)
+        mean = mean / max(count, 1) if not centred else mean
+    spread = np.sqrt(np.sum(table**2, axis=0) / max(count, 1))[:-1]
+    spread = np.maximum(spread, np.finfo(float).tiny)
+    return np.linalg.lstsq(table[:, :-1] / spread, table[:, -1], rcond=1e-10)[0] / spread
+
+
+def _white(values: Array, parts: Sequence[slice]) -> float:
     """Variance of what is white in samples ``(sample,)`` of runs, by their differences."""
-    third = np.diff(values, n=3)[within[2:] & within[1:-1] & within[:-2]]
-    noise = (np.median(np.abs(third)) / _QUARTILE) ** 2 / _BINOMIAL
+    third = np.concatenate([np.diff(values[rows], n=3) for rows in parts])
+    noise = (_median_size(third) / _QUARTILE) ** 2 / _BINOMIAL
     # What is white must also be white over two steps; jumps and slow changes are not.
-    wide = (values[2:] - values[:-2])[within[1:] & within[:-1]]
-    return float(min(noise, (np.median(np.abs(wide)) / _QUARTILE) ** 2 / 2))
+    wide = np.concatenate([values[rows][2:] - values[rows][:-2] for rows in parts])
+    return float(min(noise, (_median_size(wide) / _QUARTILE) ** 2 / 2))
 
 
-def _partial_variance(inputs: Array) -> Array:
+def _median_size(values: Array) -> float:
+    """Median of the absolute values, which are lost."""
+    return float(np.median(np.abs(values, out=values), overwrite_input=True))
+
+
+def _partial_variance(inputs: Array, parts: Sequence[slice]) -> Array:
     """Variance of each input that the others do not explain."""
-    z = inputs - inputs.mean(axis=0)
-    scale = np.maximum(z.std(axis=0), np.finfo(float).tiny)
-    z /= scale
-    correlations = z.T @ z / len(z)
-    inverse = np.linalg.pinv(correlations, rcond=1e-12, hermitian=True)
+    mean, tiny = inputs.mean(axis=0), np.finfo(float).tiny
+    scale = np.maximum(std_over(inputs, None), tiny)
+    correlations = np.zeros((len(scale), len(scale)))
+    for rows in parts:
+        z = (inputs[rows] - mean) / scale
+        correlations += z.T @ z
+    inverse = np.linalg.pinv(correlations / len(inputs), rcond=1e-12, hermitian=True)
     return scale**2 / np.maximum(np.diag(inverse), 1.0)

@@ -98,32 +98,29 @@ def _rows(
     samples: Samples, steps: Sequence[Steps], slopes: Sequence[tuple[Array, Array]]
 ) -> Samples:
     """Samples that tell their derivative, and intervals between others, run by run."""
-    parts: list[tuple[Array, ...]] = []
+    parts, own = list[tuple[Array, ...]](), samples.parts
     for k, (s, ends) in enumerate(zip(steps, slopes, strict=True)):
-        mine = np.flatnonzero(samples.runs == k)[s.own]
         half = np.diff(s.time) / 2
         stands = (np.append(half, 0.0) + np.insert(half, 0, 0.0))[s.own]
         inputs, rates, spans, times = s.rows(ends)
         run = (
-            np.concatenate([samples.inputs[mine], inputs]),
-            np.concatenate([samples.derivatives[mine], rates]),
+            np.concatenate([samples.inputs[own[k]][s.own], inputs]),
+            np.concatenate([samples.derivatives[own[k]][s.own], rates]),
             np.concatenate([stands, spans]),
             np.concatenate([s.time[s.own], times]),
         )
         order = np.argsort(run[-1], kind="stable")
-        parts.append((*(part[order] for part in run), np.full(len(order), k)))
-    inputs, derivatives, weights, times, runs = (
-        np.concatenate(p) for p in zip(*parts, strict=True)
-    )
+        parts.append(tuple(part[order] for part in run))
+    *stacked, times = zip(*parts, strict=True)
+    inputs, derivatives, weights = (np.concatenate(p) for p in stacked)
     alike = np.ptp(weights) <= _EQUAL * weights.mean()
     none = {name: np.empty((0, 0)) for name in ("outputs", "harmonics", "field")}
     return replace(
         samples,
         inputs=inputs,
         derivatives=derivatives,
-        time=times,
+        times=times,
         psi=np.empty(0),
-        runs=runs,
         weights=None if alike else weights / weights.mean(),
         steps=(),
         **none,

@@ -317,14 +317,14 @@ class _Parts:
 
     def around(self, k: int) -> _Sums | None:
         """Sums of residuals and outputs in one band, without features."""
-        runs = range(int(self.samples.runs.max()) + 1)
+        runs = range(len(self.samples.times))
         parts = [p for run in runs for p in self._band(run, k, None)]
         return _summed(parts) if parts else None
 
     def _band(self, run: int, k: int, azimuth: Azimuth | None) -> list[_Sums]:
         """Blocks of one run, between two frequencies; none where it resolves less than a turn."""
-        s, rows = self.samples, self.samples.runs == run
-        time, psi = s.time[rows], s.psi[rows]
+        s, rows = self.samples, self.samples.parts[run]
+        time, psi = s.times[run], s.psi[rows]
         steps = np.diff(time)
         mesh, step = time, float(np.median(steps))
         turns = abs(psi[-1] - psi[0]) / (2 * np.pi)

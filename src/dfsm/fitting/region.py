@@ -8,6 +8,7 @@ Mahalanobis's, and how large it may be follows from runs that did not enter the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +84,7 @@ def whiten(
     inputs
         Training samples, shape ``(sample, input)``.
     runs
-        Run of every sample, ``(sample,)``.
+        Run of every sample, ``(sample,)``; runs one after the other.
     bins
         Samples of every operating point; one for all without a schedule.
     schedule
@@ -100,31 +101,34 @@ def whiten(
         of I at an operating point with mean μ is |W (I − μ)|; its first components depend on the
         columns in `first` alone.
     """
-    std = std_over(inputs, weights)
+    mean, std = mean_over(inputs, weights), std_over(inputs, weights)
     std = np.where(std > 0, std, 1.0)
-    z = (inputs - mean_over(inputs, weights)) / std
-    order = np.concatenate([first, np.delete(np.arange(z.shape[1]), first)])
-    groups = _groups(runs)
+    order = np.concatenate([first, np.delete(np.arange(len(std)), first)])
+    groups, bin_of = _groups(runs), np.zeros(len(inputs), dtype=np.int8)
+    for place, rows in enumerate(bins):
+        bin_of[rows] = place
 
-    def sums_of(rows: IntArray) -> Array:
-        return _sums(z[rows], None if weights is None else weights[rows])
+    def sums_of(group: slice) -> list[Array]:
+        z, own = (inputs[group] - mean) / std, bin_of[group]
+        w = None if weights is None else weights[group]
+        inside = [own == place for place in range(len(bins))]
+        return [_sums(z[rows], None if w is None else w[rows]) for rows in inside]
 
-    sums = np.array([[sums_of(b[groups[b] == k]) for b in bins] for k in np.unique(groups)])
+    # One group after the other: standardised samples would take as much memory again.
+    sums = np.array([sums_of(group) for group in groups])
     total = sums.sum(axis=0)
     means = total[:, 0, 1:] / total[:, :1, 0]
     grid = means[:, schedule or 0]
-    distances = []
-    for k in np.unique(groups):
-        mine, others = groups == k, total - sums[k]
+    distances = np.empty(len(inputs))
+    for group, own in zip(groups, sums, strict=True):
+        others = total - own
         # A point that only this run has seen is measured by its own data.
-        enough = others[:, 0, 0] > 2 * z.shape[1]
+        enough = others[:, 0, 0] > 2 * len(std)
         used = np.where(enough[:, None, None], others, total)
         W = np.stack([_whitening(s, order) for s in used])
-        middles = used[:, 0, 1:] / used[:, :1, 0]
-        distances.append(np.sqrt(_squared(z[mine], grid, z[mine, schedule or 0], middles, W)))
-    by_group = np.argsort(groups, kind="stable")
-    weights = None if weights is None else weights[by_group]
-    reach = float(quantiles_over(np.concatenate(distances), _SHARE, weights))
+        middles, z = used[:, 0, 1:] / used[:, :1, 0], (inputs[group] - mean) / std
+        distances[group] = np.sqrt(_squared(z, grid, z[:, schedule or 0], middles, W))
+    reach = float(quantiles_over(distances, _SHARE, weights))
     return np.stack([_whitening(s, order) for s in total]) / std, reach
 
 
@@ -133,11 +137,12 @@ def _squared(z: Array, grid: Array, value: Array, middles: Array, W: Array) -> j
     return squared_distance(z, hats(grid, value), middles, W)
 
 
-def _groups(runs: IntArray) -> IntArray:
+def _groups(runs: IntArray) -> list[slice]:
     """Parts of the data that are judged by the others: runs, or quarters of a single one."""
-    if len(np.unique(runs)) > 1:
-        return runs
-    return np.arange(len(runs)) * 4 // len(runs)
+    ends = (np.flatnonzero(np.diff(runs)) + 1).tolist()
+    if not ends:
+        ends = [-(-len(runs) * k // 4) for k in (1, 2, 3)]
+    return [slice(start, stop) for start, stop in pairwise([0, *ends, len(runs)]) if stop > start]
 
 
 def _sums(z: Array, weights: Array | None) -> Array:

@@ -44,8 +44,8 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
     inputs = samples.inputs.copy()
     names = model.signals.names("states")
     columns = model.signals.state_columns
-    for k, (run, rollout) in enumerate(zip(data, rollouts, strict=True)):
+    for run, rollout, rows in zip(data, rollouts, samples.parts, strict=True):
         if rollout.status is Status.COMPLETED:
             inside = rollout.trajectory.window(known_from(run, settings), settings.stop)
-            inputs[samples.runs == k, columns] = inside.select(names).values
+            inputs[rows, columns] = inside.select(names).values
     return replace(samples, inputs=inputs)

@@ -42,7 +42,7 @@ def rough_note(samples: Samples, name: str, row: Array, target: Array, left: Arr
     column = max(columns, key=lambda c: float(size[c]))
     if size[column] < _MATTERS * spread or column in _held(samples):
         return ""
-    runs = [samples.inputs[samples.runs == k, column] for k in np.unique(samples.runs)]
+    runs = [samples.inputs[rows, column] for rows in samples.parts]
     seen = [r for values in runs if (r := roughness(values)).rough] or [Roughness(1.0, 1.0)]
     turns, fast = (float(np.mean(v)) for v in zip(*seen, strict=True))
     return (
@@ -60,4 +60,4 @@ def _held(samples: Samples) -> list[int]:
         return []
     states = samples.inputs[:, samples.signals.observed_columns]
     driving = samples.inputs[:, samples.signals.order.driving_columns]
-    return held_unseen(states, driving, samples.runs)
+    return held_unseen(lambda: samples.blocks(states, driving))

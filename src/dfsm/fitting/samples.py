@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -28,16 +29,12 @@ from dfsm.data.derivatives import (
     state_units,
 )
 from dfsm.data.features import unknown_until
-from dfsm.data.info import gap_warning
-from dfsm.data.signs import held_interval, wrap_notes
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
-from dfsm.data.stuck import stuck_notes
 from dfsm.data.suspects import screened
 from dfsm.data.trajectory import Channel, Role, Trajectory
-from dfsm.data.wind import CORRECTED_WIND, WIND_SOURCES, wind_warning
+from dfsm.data.wind import CORRECTED_WIND, WIND_SOURCES
 from dfsm.errors import DfsmError
-from dfsm.fitting.held_inputs import held_note, held_unseen
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.inputs import InputOrder
 from dfsm.models.signals import (
@@ -66,11 +63,10 @@ class Samples:
         I, Ẋ, Y and the blade-passing harmonics without a field, shapes ``(sample, n)``.
     field
         Harmonics of the wind field, `SignalTable.field`, shape ``(sample, n)``.
-    time, psi
-        Time of each run in s and recorded azimuth in rad, which goes on growing after a turn (zero
-        without), ``(sample,)``.
-    runs
-        Run index of each sample, shape ``(sample,)``.
+    times
+        Times in s of every run, each ``(time,)``.
+    psi
+        Recorded azimuth in rad, which goes on growing after a turn (zero without), ``(sample,)``.
     signals
         What the columns mean.
     derivative_names
@@ -92,15 +88,30 @@ class Samples:
     outputs: Array
     harmonics: Array
     field: Array
-    time: Array
+    times: tuple[Array, ...]
     psi: Array
-    runs: IntArray
     signals: SignalTable
     derivative_names: tuple[tuple[str, str], ...]
     terms: Terms | None = None
     weights: Array | None = None
     steps: tuple[Steps, ...] = ()
     rough: tuple[str, ...] = ()
+
+    @property
+    def time(self) -> Array:
+        """Time of each sample in its run in s, ``(sample,)``."""
+        return np.concatenate(self.times)
+
+    @property
+    def runs(self) -> IntArray:
+        """Run index of each sample, ``(sample,)``."""
+        return np.repeat(np.arange(len(self.times)), [len(time) for time in self.times])
+
+    @property
+    def parts(self) -> list[slice]:
+        """The samples of every run."""
+        ends = np.cumsum([0, *(len(time) for time in self.times)]).tolist()
+        return [slice(start, stop) for start, stop in pairwise(ends)]
 
     @property
     def linear_inputs(self) -> Array:
@@ -137,21 +148,16 @@ class Samples:
 
     def blocks(self, inputs: Array, targets: Array) -> Iterator[tuple[Array, Array]]:
         """Samples run by run."""
-        for inside in self._runs():
+        for inside in self.parts:
             yield inputs[inside], targets[inside]
 
     def weighted_blocks(
-        self, inputs: Array, targets: Array
+        self, inputs: Array, targets: Array, rows: Sequence[int]
     ) -> Iterator[tuple[Array, Array, Array | None]]:
-        """Samples run by run with their weights."""
-        for inside in self._runs():
+        """Samples run by run with their weights, and some of the targets."""
+        for inside in self.parts:
             weights = None if self.weights is None else self.weights[inside]
-            yield inputs[inside], targets[inside], weights
-
-    def _runs(self) -> Iterator[slice]:
-        ends = np.flatnonzero(np.diff(self.runs, append=-1)) + 1
-        for start, stop in zip([0, *ends[:-1]], ends, strict=True):
-            yield slice(start, stop)
+            yield inputs[inside], targets[inside][:, rows], weights
 
 
 def only_read(
@@ -221,69 +227,6 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
     return data
 
 
-def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> list[str]:
-    """What a user should know about the data before trusting a fit, one sentence each."""
-    doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
-    warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
-    for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
-        if values.min() == values.max():
-            warnings.append(
-                f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
-                "model: leave it out, or add runs in which it varies"
-            )
-    warnings += wrap_notes(data, (*settings.controls, *settings.driving, *settings.outputs))
-    names = data.names
-    for run in data:
-        window = run.window(settings.start, settings.stop)
-        warnings += [f"{run.where}: {text}" for text in stuck_notes(window, names)]
-    gaps = [
-        f"{run.where}: {text}"
-        for run in data
-        if (text := gap_warning(run.window(settings.start, settings.stop)))
-    ]
-    if gaps:
-        more = f" ({len(gaps)} of the {len(data)} runs have gaps)" if len(gaps) > 1 else ""
-        warnings.append(gaps[0] + more)
-    return warnings
-
-
-def held_records(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
-    """Channels whose samples stay where the fit takes them for motion, with a sentence each."""
-    return _held_states(data, settings) | _held_inputs(data, settings, samples)
-
-
-def _held_states(data: Dataset, settings: FitSettings) -> dict[str, str]:
-    """States whose record is slower than its mesh: steps where there is motion."""
-    told = dict[str, str]()
-    for name in dict.fromkeys(n for s in settings.states for n in s.channels):
-        for run in data:
-            if interval := held_interval(run.time, run[name]):
-                told[name] = (
-                    f"{run.where}: '{name}' changes every {interval:g} s only and stays as it was "
-                    "in between, so its derivative is that of steps and its coefficients come out "
-                    f"too small: set data.slower: {{{name}: linear}}, or give that record alone"
-                )
-                break
-    return told
-
-
-def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
-    """Inputs that are taken for lines by nobody's choice, and act as held ones."""
-    chosen = settings.inputs or {}
-    if isinstance(chosen, str) or samples.weights is not None:
-        return {}
-    names, states = samples.signals.driving, [s.name for s in settings.states]
-    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
-    found = held_unseen(
-        np.concatenate([run.select(states).values for run in runs]),
-        np.concatenate([run.select(names).values for run in runs]),
-        samples.runs,
-    )
-    kinds = samples.signals.between
-    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in chosen]
-    return {name: held_note(name) for name in lines}
-
-
 def extract(data: Dataset, settings: FitSettings) -> Samples:
     """Take the state derivatives of every run and stack the samples (Sec. 3.3)."""
     signals = _signals(data, settings)
@@ -308,7 +251,8 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
-        times.append(run.time[rows])
+        # Of the data where it can be: many runs would not fit into memory twice.
+        times.append(run.window(known_from(whole_run, settings), settings.stop).time)
         place = slice(begin, begin := begin + len(times[-1]))
         azimuth = settings.azimuth
         if azimuth is not None:
@@ -328,8 +272,7 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
     require_moving(settings.states, inputs[:, signals.observed_columns])
     return Samples(
         **tables,
-        time=np.concatenate(times),
-        runs=np.repeat(np.arange(len(data)), [len(time) for time in times]),
+        times=tuple(times),
         signals=signals,
         derivative_names=labels,
         terms=terms_of(settings.terms, signals.inputs, inputs),

@@ -40,8 +40,7 @@ def schedule_gaps(samples: Samples, model: LinearModel) -> list[str]:
         return []
     spacing = float(np.diff(np.asarray(model.grid)).mean())
     values, operating = samples.inputs[:, column], list[tuple[float, float]]()
-    for run in np.unique(samples.runs):
-        rows = samples.runs == run
+    for rows in samples.parts:
         weights = None if samples.weights is None else samples.weights[rows]
         middle, reach = mean_over(values[rows], weights), _AROUND * std_over(values[rows], weights)
         operating.append((float(middle - reach), float(middle + reach)))

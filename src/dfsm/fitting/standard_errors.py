@@ -13,10 +13,13 @@ make good for; where none is left, nothing is known.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from dfsm.core.types import Array, IntArray
 from dfsm.numerics.least_squares import correlation_length
+from dfsm.numerics.time_mesh import std_over
 
 _PER_MEMORY = 10
 # A derivative out of a spline draws on about so many samples.
@@ -41,26 +44,33 @@ def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
         ``(input,)`` in the unit of the row per unit of the input; infinite where there are fewer
         independent samples than coefficients, and for inputs that do not vary.
     """
-    x = inputs - inputs.mean(axis=0)
-    scale = x.std(axis=0)
-    varies = scale > 1e-12 * np.maximum(np.abs(inputs).max(axis=0), np.finfo(float).tiny)
-    errors = np.full(x.shape[1], np.inf)
-    if not varies.any():
+    mean, scale = inputs.mean(axis=0), std_over(inputs, None)
+    largest = np.maximum(inputs.max(axis=0), -inputs.min(axis=0))
+    varies = scale > 1e-12 * np.maximum(largest, np.finfo(float).tiny)
+    errors, count = np.full(inputs.shape[1], np.inf), int(varies.sum())
+    if not count:
         return errors
-    x = x if varies.all() else x[:, varies]
-    x /= scale[varies]
-    inverse = np.linalg.pinv(x.T @ x, rcond=1e-13, hermitian=True)
-    ends = np.flatnonzero(np.diff(runs, append=-1)) + 1
-    variance, independent = np.zeros(x.shape[1]), 0.0
-    for start, stop in zip([0, *ends[:-1]], ends, strict=True):
-        remembers = float(correlation_length(left[start:stop, None])[0])
-        independent += (stop - start) / max(remembers, _STENCIL)
+
+    def standardised(rows: slice) -> Array:
+        return (inputs[rows] - mean)[:, varies] / scale[varies]
+
+    ends = [0, *(np.flatnonzero(np.diff(runs)) + 1).tolist(), len(runs)]
+    parts = [slice(start, stop) for start, stop in pairwise(ends)]
+    products = np.zeros((count, count))
+    for rows in parts:
+        x = standardised(rows)
+        products += x.T @ x
+    inverse = np.linalg.pinv(products, rcond=1e-13, hermitian=True)
+    variance, independent = np.zeros(count), 0.0
+    for rows in parts:
+        here, g = left[rows, None], standardised(rows) @ inverse
+        remembers = float(correlation_length(here)[0])
+        independent += len(here) / max(remembers, _STENCIL)
         # Sums over much less than the residual remembers do not change how sums vary.
-        places = np.arange(0, stop - start, max(1, int(remembers / _PER_MEMORY)))
-        g = x[start:stop] @ inverse
-        products = np.add.reduceat(g * left[start:stop, None], places, axis=0)
-        variance += correlation_length(products) * np.sum(products**2, axis=0)
-    free = independent - x.shape[1] - 1
+        places = np.arange(0, len(here), max(1, int(remembers / _PER_MEMORY)))
+        sums = np.add.reduceat(g * here, places, axis=0)
+        variance += correlation_length(sums) * np.sum(sums**2, axis=0)
+    free = independent - count - 1
     if free > 0:
         errors[varies] = np.sqrt(variance * independent / free) / scale[varies]
     return errors

@@ -17,6 +17,7 @@ from dfsm.fitting.doubts import Doubts
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.stability import Growth
+from dfsm.numerics.time_mesh import std_over
 from dfsm.simulation.simulate import Simulation, Status
 
 # Error of a rollout over the standard deviation of the record. At 0.3 a curve lies on the other but
@@ -111,15 +112,14 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
 
 def _error(name: str, values: Array, samples: Samples, rollouts: Mapping[int, Simulation]) -> float:
     """Mean over the runs of the relative error; NaN where the channel moves in none."""
-    errors = []
+    errors, whole = [], std_over(values, None)
     for run, rollout in rollouts.items():
-        rows = samples.runs == run
-        time, truth = samples.time[rows], values[rows]
+        time, truth = samples.times[run], values[samples.parts[run]]
         weight = np.gradient(time)
         weight /= weight.sum()
         spread = float(np.sqrt(weight @ (truth - weight @ truth) ** 2))
         off = np.interp(time, rollout.trajectory.time, rollout.trajectory[name]) - truth
-        if spread > _MOVES * values.std():
+        if spread > _MOVES * whole:
             errors.append(float(np.sqrt(weight @ off**2)) / spread)
     return float(np.mean(errors)) if errors else float("nan")
 

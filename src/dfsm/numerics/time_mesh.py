@@ -19,8 +19,8 @@ _MOST_DECIMALS = 8
 _FEWEST = 4
 # Share of the usual step below which two samples are one instant.
 _INSTANT = 1e-6
-# Samples of a mesh that are looked at together.
-_BLOCK = 1_000_000
+# Samples of a mesh that are looked at together, and those of many channels.
+_BLOCK, _ROWS = 1_000_000, 2**16
 
 
 def time_step(time: Series) -> float | None:
@@ -178,14 +178,38 @@ def weights_over_time(times: Sequence[Series]) -> Series | None:
 
 def mean_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
     """Mean over samples ``(sample, ...)`` with weights ``(sample,)``; None takes all alike."""
-    return values.mean(axis=0) if weights is None else np.average(values, axis=0, weights=weights)
+    if weights is None:
+        return values.mean(axis=0)
+    if len(values) <= _ROWS:
+        return np.average(values, axis=0, weights=weights)
+    return _mean_of(values, weights, lambda part: part)
 
 
 def std_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
     """Standard deviation over samples, with weights as in `mean_over`."""
-    if weights is None:
+    if weights is None and len(values) <= _ROWS:
         return values.std(axis=0)
-    return np.sqrt(mean_over((values - mean_over(values, weights)) ** 2, weights))
+    mean = mean_over(values, weights)
+    return np.sqrt(_mean_of(values, weights, lambda part: (part - mean) ** 2))
+
+
+def rms_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
+    """Root of the mean square over samples, with weights as in `mean_over`."""
+    return np.sqrt(_mean_of(values, weights, np.square))
+
+
+def _mean_of(
+    values: np.ndarray, weights: Series | None, change: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Mean of what becomes of samples, part by part: all at once would need as much memory."""
+    if len(values) <= _ROWS:
+        return mean_over(change(values), weights)
+    total = np.zeros(values.shape[1:])
+    for start in range(0, len(values), _ROWS):
+        rows = slice(start, start + _ROWS)
+        part = change(values[rows])
+        total += part.sum(axis=0) if weights is None else np.tensordot(weights[rows], part, 1)
+    return total / (len(values) if weights is None else weights.sum())
 
 
 def quantiles_over(

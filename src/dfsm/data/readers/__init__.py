@@ -124,8 +124,11 @@ def read_all(
     DfsmError
         A pattern matches nothing, a file is missing, or one cannot be read.
     """
-    paths = track(_paths(patterns, base), "Reading runs")
-    return [read(path, step) if keep is None else keep(read(path, step)) for path in paths]
+    runs: list[Trajectory] = []
+    for path in track(_paths(patterns, base), "Reading runs"):
+        run = read(path, step) if keep is None else keep(read(path, step))
+        runs.append(run.on_time_of(runs[-1]) if runs else run)
+    return runs
 
 
 def describe_all(

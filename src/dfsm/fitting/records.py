@@ -1,0 +1,73 @@
+"""What a user should know of the records that a fit rests on."""
+
+from __future__ import annotations
+
+from dfsm.data.dataset import Dataset
+from dfsm.data.info import gap_warning
+from dfsm.data.signs import held_interval, wrap_notes
+from dfsm.data.stuck import stuck_notes
+from dfsm.data.wind import wind_warning
+from dfsm.fitting.held_inputs import held_note, held_unseen
+from dfsm.fitting.samples import Samples, known_from
+from dfsm.fitting.settings import FitSettings
+
+
+def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> list[str]:
+    """What a user should know about the data before trusting a fit, one sentence each."""
+    doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
+    warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
+    for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
+        if values.min() == values.max():
+            warnings.append(
+                f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
+                "model: leave it out, or add runs in which it varies"
+            )
+    warnings += wrap_notes(data, (*settings.controls, *settings.driving, *settings.outputs))
+    names = data.names
+    for run in data:
+        window = run.window(settings.start, settings.stop)
+        warnings += [f"{run.where}: {text}" for text in stuck_notes(window, names)]
+    gaps = [
+        f"{run.where}: {text}"
+        for run in data
+        if (text := gap_warning(run.window(settings.start, settings.stop)))
+    ]
+    if gaps:
+        more = f" ({len(gaps)} of the {len(data)} runs have gaps)" if len(gaps) > 1 else ""
+        warnings.append(gaps[0] + more)
+    return warnings
+
+
+def held_records(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
+    """Channels whose samples stay where the fit takes them for motion, with a sentence each."""
+    return _held_states(data, settings) | _held_inputs(data, settings, samples)
+
+
+def _held_states(data: Dataset, settings: FitSettings) -> dict[str, str]:
+    """States whose record is slower than its mesh: steps where there is motion."""
+    told = dict[str, str]()
+    for name in dict.fromkeys(n for s in settings.states for n in s.channels):
+        for run in data:
+            if interval := held_interval(run.time, run[name]):
+                told[name] = (
+                    f"{run.where}: '{name}' changes every {interval:g} s only and stays as it was "
+                    "in between, so its derivative is that of steps and its coefficients come out "
+                    f"too small: set data.slower: {{{name}: linear}}, or give that record alone"
+                )
+                break
+    return told
+
+
+def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
+    """Inputs that are taken for lines by nobody's choice, and act as held ones."""
+    chosen = settings.inputs or {}
+    if isinstance(chosen, str) or samples.weights is not None:
+        return {}
+    names, states = samples.signals.driving, [s.name for s in settings.states]
+    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
+    found = held_unseen(
+        lambda: ((run.select(states).values, run.select(names).values) for run in runs)
+    )
+    kinds = samples.signals.between
+    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in chosen]
+    return {name: held_note(name) for name in lines}
