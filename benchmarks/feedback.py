@@ -70,7 +70,7 @@ def _judged(
     row = np.linalg.lstsq(inputs - inputs.mean(axis=0), slope - slope.mean(), rcond=None)[0]
     left = slope - slope.mean() - (inputs - inputs.mean(axis=0)) @ row
     time = np.arange(float(len(u)))
-    series = residuals_of(time, np.zeros(len(u), dtype=int), inputs, slope, left)
+    series = residuals_of([time], inputs, slope, left)
     if series is None:
         return None
     A = np.array([row[1:]]) if order == 1 else np.array([[0.0, 1.0], row[1:]])

@@ -113,6 +113,7 @@ def test_files_are_found_from_the_folder_of_the_config(folder, tmp_path, monkeyp
     config, runs = load_config(folder / "config.yaml")
     assert config.linear == LTI()
     assert [Path(r.source or "").name for r in runs] == ["a.csv", "b.parquet", "c.outb"]
+    assert runs[1].time is runs[0].time  # the same times, held once
 
 
 def test_a_fit_keeps_only_the_channels_that_it_reads(folder):
@@ -127,6 +128,10 @@ def test_a_fit_keeps_only_the_channels_that_it_reads(folder):
     ours, theirs = extract(data, settings), extract(select(whole, settings), settings)
     for name in ("inputs", "derivatives", "outputs", "time", "psi", "runs"):
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    # Nor of what samples only repeat.
+    for run, time, recorded in zip(data, ours.times, ours.recorded, strict=True):
+        assert np.shares_memory(time, run.time)
+        assert np.shares_memory(recorded, run.values)
     # Where one is lacking all are kept, for the message that names the near ones.
     lacking = replace(settings, controls=("uu",))
     assert only_read(whole[0], lacking) is whole[0]

@@ -28,6 +28,7 @@ from dfsm.data.trajectory import Channel
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
 from dfsm.fitting.held_inputs import held_unseen
+from dfsm.fitting.noisy_inputs import effect_of_fast_parts, noise_shares
 from dfsm.fitting.standard_errors import standard_errors
 from dfsm.fitting.verdicts import grade
 from dfsm.models.stability import Growth
@@ -166,6 +167,25 @@ def test_noise_of_a_sensor_is_told_and_a_white_input_is_not():
     quietly([plant(lambda x, i, k: np.interp(k, at, white), np.zeros(400), 400)])
 
 
+def test_noise_is_judged_within_runs():
+    rng = np.random.default_rng(6)
+    slow_ones = np.cumsum(rng.standard_normal((600, 2)), axis=0) * 0.05
+    inputs = slow_ones + np.array([0.0, 0.3]) * rng.standard_normal((600, 2))
+    inputs[300:] += 50.0  # between runs, which no difference may see
+    target, row = slow_ones @ [1.0, 2.0], np.array([1.0, 2.0])
+    parts = [slice(0, 300), slice(300, 600)]
+    seconds = [np.diff(np.column_stack([inputs[p], target[p]]), 2, axis=0) for p in parts]
+    fast = np.concatenate(seconds) - np.concatenate(seconds).mean(axis=0)
+    effect = np.linalg.lstsq(fast[:, :2], fast[:, 2], rcond=None)[0]
+    assert np.abs(effect[1]) < 0.3 * row[1]
+    assert_allclose(effect_of_fast_parts(inputs, target, parts), effect, rtol=1e-9)
+    shares = noise_shares(inputs, target, parts, row)
+    others = np.column_stack([inputs[:, 0], np.ones(600)])
+    own = inputs[:, 1] - others @ np.linalg.lstsq(others, inputs[:, 1], rcond=None)[0]
+    assert shares[0] == 0
+    assert_allclose(shares[1], 0.09 / own.var(), rtol=0.3)
+
+
 def test_standard_errors_are_the_scatter_of_fits():
     rng = np.random.default_rng(4)
     slopes, errors = [], []
@@ -174,7 +194,7 @@ def test_standard_errors_are_the_scatter_of_fits():
         slope = float(x[:, 0] @ r / (x[:, 0] @ x[:, 0]))
         slopes.append(slope)
         left = r - slope * x[:, 0]
-        errors.append(standard_errors(x, left, np.zeros(1000, dtype=int))[0])
+        errors.append(standard_errors(x, left, [slice(0, 1000)])[0])
     assert 0.6 < np.mean(errors) / np.std(slopes) < 1.4
 
 
@@ -292,6 +312,8 @@ def test_an_input_that_is_held_and_new_at_every_sample_is_told():
         lines[k + 1] = decay * lines[k] + (1 - decay) * u[k] + ramp * step
     assert held_unseen(lambda: [(held[:, None], u[:, None])]) == [0]
     assert held_unseen(lambda: [(lines[:, None], u[:, None])]) == []
+    halves = [(held[k : k + 400, None], u[k : k + 400, None]) for k in (0, 400)]
+    assert held_unseen(lambda: halves) == [0]
     _, notes = told([run(np.arange(800.0), x=held, u=u)])
     assert any("set inputs: {u: hold}" in note for note in notes)
     chosen = fit([run(np.arange(800.0), x=held, u=u)], replace(SETTINGS, inputs="hold")).model

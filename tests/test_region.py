@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -164,12 +165,11 @@ def test_an_optimum_stays_near_the_data_if_asked(model):
 
 def test_a_single_run_is_judged_by_its_quarters(runs):
     inputs = runs[0].select(["u", "w", "q"]).values
-    zeros = np.zeros(len(inputs), dtype=int)
-    every = [np.arange(len(inputs))]
-    _, reach = whiten(inputs, zeros, every, None, np.array([1]))
-    _, several = whiten(
-        inputs, np.arange(len(inputs)) * 4 // len(inputs), every, None, np.array([1])
-    )
+    one = np.zeros(len(inputs), dtype=int)
+    _, reach = whiten(inputs, [slice(0, len(inputs))], one, None, np.array([1]))
+    ends = np.searchsorted(np.arange(len(inputs)) * 4 // len(inputs), range(5))
+    quarters = [slice(a, b) for a, b in pairwise(ends.tolist())]
+    _, several = whiten(inputs, quarters, one, None, np.array([1]))
     assert reach == several
 
 

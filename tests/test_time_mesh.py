@@ -7,9 +7,10 @@ import pytest
 
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
+from dfsm.numerics import time_mesh
 from dfsm.numerics.filters import low_pass
 from dfsm.numerics.spectra import spectrum
-from dfsm.numerics.time_mesh import time_step, without_rounding
+from dfsm.numerics.time_mesh import mean_over, rms_over, std_over, time_step, without_rounding
 
 STEP = 0.00625
 EXACT = STEP * np.arange(96001)
@@ -79,3 +80,17 @@ def test_times_beyond_single_precision_are_times():
     time = 1e300 * np.arange(5)
     assert time_step(time) == pytest.approx(1e300)
     assert np.array_equal(without_rounding(time), time)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_figures_of_many_samples_are_those_of_all_at_once(monkeypatch, weighted):
+    rng = np.random.default_rng(5)
+    values, weights = 7 + rng.normal(size=(1001, 3)), rng.uniform(0.5, 1.5, 1001)
+    at_once = np.average(values, axis=0, weights=weights if weighted else None)
+    squares = np.average((values - at_once) ** 2, axis=0, weights=weights if weighted else None)
+    monkeypatch.setattr(time_mesh, "_ROWS", 100)
+    told = weights if weighted else None
+    np.testing.assert_allclose(mean_over(values, told), at_once, rtol=1e-13)
+    np.testing.assert_allclose(std_over(values, told), np.sqrt(squares), rtol=1e-13)
+    np.testing.assert_allclose(rms_over(values, told) ** 2, squares + at_once**2, rtol=1e-13)
+    np.testing.assert_allclose(std_over(values[:, 0], told), np.sqrt(squares[0]), rtol=1e-13)

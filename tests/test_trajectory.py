@@ -150,6 +150,20 @@ def test_windows_include_both_ends(start, stop, n):
         assert run.time[0] == pytest.approx(start)
 
 
+def test_most_of_a_run_is_no_copy_and_a_small_part_does_not_keep_it_all():
+    run = make()
+    most, part = run.window(1.0), run.window(1.0, 1.5)
+    assert np.shares_memory(most.values, run.values)
+    assert not most.values.flags.writeable
+    assert not np.shares_memory(part.values, run.values)
+    assert not part.values.flags.writeable
+    other = make(seed=1).on_time_of(run)
+    assert other.time is run.time
+    assert np.array_equal(other.values, make(seed=1).values)
+    shorter = make(samples=51)
+    assert shorter.on_time_of(run) is shorter
+
+
 def test_a_run_shorter_than_the_window_is_a_sentence():
     with pytest.raises(
         DfsmError, match=r"runs from 0 s to 10 s, shorter than .* \(100 to … s\).*leave the run out"

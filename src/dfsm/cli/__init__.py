@@ -166,7 +166,10 @@ def fit(
             if chosen is not None:
                 names = (*settings.controls, *settings.driving)
                 settings = replace(settings, inputs=combined(chosen, settings.inputs, names))
-            result = run_fit(runs, settings, config_settings.refine)
+            count = len(runs)
+            # Handed over one by one: where channels are computed, the fit has runs of its own.
+            given = (runs.pop(0) for _ in range(count))
+            result = run_fit(given, settings, config_settings.refine)
             model = result.model
         replaced = output.exists() and bool(visible(output))
         write_or_keep(lambda path: save(model, path, result.nonlinear), output)
@@ -183,7 +186,7 @@ def fit(
     say(lines("\n".join(lines_of(model, warnings=False))), quiet)
     seconds = sum(result.seconds.values())
     say(
-        f"fitted {len(runs)} run{'s' * (len(runs) > 1)} in {seconds:.1f} s, saved in {output}",
+        f"fitted {count} run{'s' * (count > 1)} in {seconds:.1f} s, saved in {output}",
         quiet,
     )
 

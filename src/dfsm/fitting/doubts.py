@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
-from dfsm.core.types import Array, IntArray
+from dfsm.core.types import Array
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.fitting.coloured import pulled, pulled_note
 from dfsm.fitting.delays import late_input, late_note
@@ -93,14 +94,14 @@ def doubts(
     fit
         Of all derivatives, kinematic rows included.
     left
-        What it leaves of them, ``(sample, state)``.
+        What it leaves of those that are not kinematic, ``(sample, row)``.
     settings
         Settings.
     intervals
         Whether the samples are means over intervals.
     """
     inputs, kinematic = samples.linear_inputs, kinematic_rows(settings.states)
-    even, even_left, runs = _evenly(samples, inputs, left)
+    even, even_left, parts = _evenly(samples, inputs, left)
     mean = fit.mean_coefficients
     errors = np.full(mean.shape, np.nan)
     notes: list[str] = []
@@ -115,15 +116,15 @@ def doubts(
             )
     laws: dict[int, Law] = {}
     names, driving = samples.linear_names, len(samples.signals.driving)
-    for row in (r for r in range(len(mean)) if r not in kinematic):
+    for place, row in enumerate(r for r in range(len(mean)) if r not in kinematic):
         name, target = samples.derivative_names[row][0], samples.derivatives[:, row]
-        errors[row] = standard_errors(even, even_left[:, row], runs)
+        errors[row] = standard_errors(even, even_left[:, place], parts)
         held = {column for r, column in fit.model.known if r == row}
         errors[row, list(held)] = 0.0
         for text in _noise(name, samples, inputs, target, mean[row]):
             notes.append(text)
             reasons.append(Reason(name, "noise", "an input is noisy", "a smoother record of it"))
-        series = residuals_of(samples.time, samples.runs, inputs, target, left[:, row])
+        series = residuals_of(samples.times, inputs, target, left[:, place])
         note = None
         if series is not None:
             note = _feedback(samples, series, mean, row, held, laws)
@@ -136,7 +137,7 @@ def doubts(
             notes += told
             more = Reason(name, "chance", "effects on it may be chance", "longer or more runs")
             reasons += [more] * len(told)
-        if text := rough_note(samples, name, mean[row], target, left[:, row]):
+        if text := rough_note(samples, name, mean[row], target, left[:, place]):
             notes.append(text)
             reasons.append(
                 Reason(name, "rough", "an input is too rough for its mesh", "what is told of it")
@@ -161,15 +162,15 @@ def doubts(
     return Doubts(tuple(notes), errors, tuple(reasons))
 
 
-def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array, IntArray]:
-    """Inputs, what the fit leaves, and the runs, every sample standing for the same time."""
+def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array, list[slice]]:
+    """Inputs, what the fit leaves, and their runs, every sample standing for the same time."""
     if samples.weights is None:
-        return inputs, left, samples.runs
+        return inputs, left, samples.parts
     lengths = [np.ptp(time) for time in samples.times]
     step = sum(lengths) / len(inputs)
     counts = [max(2, round(length / step)) for length in lengths]
     both = inputs, left
-    even = tuple[Array, Array](np.empty((sum(counts), part.shape[1])) for part in both)
+    even = [np.empty((sum(counts), part.shape[1])) for part in both]
     begin = 0
     for time, count, rows in zip(samples.times, counts, samples.parts, strict=True):
         mesh = np.linspace(time[0], time[-1], count)
@@ -177,7 +178,8 @@ def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array,
             for column, values in enumerate(part[rows].T):
                 own[begin : begin + count, column] = np.interp(mesh, time, values)
         begin += count
-    return even[0], even[1], np.repeat(np.arange(len(counts)), counts)
+    ends = np.cumsum([0, *counts]).tolist()
+    return even[0], even[1], [slice(start, stop) for start, stop in pairwise(ends)]
 
 
 def _feedback(
@@ -244,7 +246,7 @@ def _unknown(
 
 
 def _noise(name: str, samples: Samples, inputs: Array, target: Array, row: Array) -> list[str]:
-    shares = noise_shares(inputs, target, samples.runs, row)
+    shares = noise_shares(inputs, target, samples.parts, row)
     count = len(samples.signals.driving)
     return [
         f"{name}: {share:.0%} of what '{samples.linear_names[i]}' does on its own is white and has "

@@ -34,7 +34,7 @@ from dfsm.fitting.doubts import Doubts, doubts
 from dfsm.fitting.gate import correct, left_over, predicted
 from dfsm.fitting.hidden.advice import hidden_advice
 from dfsm.fitting.hidden.build import fit_hidden, require_hidden
-from dfsm.fitting.known import known_coefficients
+from dfsm.fitting.known import fitted_rows, known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
@@ -124,7 +124,8 @@ def fit(
         rows, samples = over_intervals(samples, lambda rows: _fit_slopes(rows, settings))
         f = _fit_derivatives(rows, settings)
     with _timed(seconds, "doubts"):
-        left = left_over(f.model, rows, rows.linear_inputs, rows.derivatives)
+        fitted = fitted_rows(rows, settings)
+        left = left_over(f.model, rows, rows.linear_inputs, rows.derivatives, fitted)
         doubt = doubts(rows, f, left, settings, intervals=rows is not samples)
         del left
     with _timed(seconds, "corrective functions"):
@@ -225,8 +226,7 @@ def fit(
 
 def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
     """Linear fit of ξ̇; kinematic rows d q = q̇ are written down, not fitted."""
-    kinematic = kinematic_rows(settings.states)
-    fitted = [i for i in range(samples.derivatives.shape[1]) if i not in kinematic]
+    kinematic, fitted = kinematic_rows(settings.states), fitted_rows(samples, settings)
     known = known_coefficients(samples, settings, fitted)
     inputs, first = samples.linear_inputs, {**known.first, **known.fixed}
     result = _linear(samples, inputs, samples.derivatives, settings, fitted, first)

@@ -82,7 +82,7 @@ def correct(
     -------
     Correction
     """
-    residuals = left_over(linear.model, samples, inputs, targets)
+    residuals = left_over(linear.model, samples, inputs, targets, range(targets.shape[1]))
     rms = rms_over(residuals, samples.weights)
     std = std_over(targets, samples.weights)
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
@@ -160,11 +160,13 @@ def _train(
     return fit_corrective(seen, residuals, runs, settings.corrective, settings.seed, weights)
 
 
-def left_over(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
-    """What a linear fit leaves of its targets ``(sample, target)``, run by run."""
-    residuals = np.empty_like(targets)
+def left_over(
+    model: LinearModel, samples: Samples, inputs: Array, targets: Array, columns: Sequence[int]
+) -> Array:
+    """What a linear fit leaves of some of its targets, ``(sample, column)``, run by run."""
+    residuals = np.empty((len(targets), len(columns)))
     for rows in samples.parts:
-        residuals[rows] = targets[rows] - predicted(model, inputs[rows])
+        residuals[rows] = (targets[rows] - predicted(model, inputs[rows]))[:, columns]
     return residuals
 
 

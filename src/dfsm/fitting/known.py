@@ -31,6 +31,12 @@ class KnownCoefficients:
     balances: tuple[int, ...] = ()
 
 
+def fitted_rows(samples: Samples, settings: FitSettings) -> list[int]:
+    """Rows of ξ̇ that are fitted: all but those that are states themselves."""
+    kinematic = kinematic_rows(settings.states)
+    return [row for row in range(samples.derivatives.shape[1]) if row not in kinematic]
+
+
 def known_coefficients(
     samples: Samples, settings: FitSettings, fitted: Sequence[int]
 ) -> KnownCoefficients:

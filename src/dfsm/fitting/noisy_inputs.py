@@ -9,12 +9,11 @@ only where the derivative does not follow it as the fit says.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dfsm.core.types import Array, IntArray
+from dfsm.core.types import Array
 from dfsm.numerics.time_mesh import std_over
 
 # Share of an input's own variance from which noise is told, and share of the fitted effect below
@@ -25,15 +24,15 @@ _QUARTILE, _BINOMIAL = 0.6745, 20.0
 _FEWEST = 100
 
 
-def noise_shares(inputs: Array, target: Array, runs: IntArray, row: Array) -> Array:
+def noise_shares(inputs: Array, target: Array, parts: Sequence[slice], row: Array) -> Array:
     """Share of each input's own variance that is noise without an effect.
 
     Parameters
     ----------
     inputs, target
         Equidistant samples ``(sample, input)`` and the derivative ``(sample,)``.
-    runs
-        Run of every sample.
+    parts
+        The samples of every run.
     row
         Fitted coefficients, ``(input,)``.
 
@@ -46,21 +45,19 @@ def noise_shares(inputs: Array, target: Array, runs: IntArray, row: Array) -> Ar
     shares = np.zeros(inputs.shape[1])
     if len(inputs) < _FEWEST:
         return shares
-    ends = [0, *(np.flatnonzero(np.diff(runs)) + 1).tolist(), len(runs)]
-    parts = [slice(start, stop) for start, stop in pairwise(ends)]
     own = _partial_variance(inputs, parts)
     noise = np.array([_white(column, parts) for column in inputs.T])
     share = noise / np.maximum(own, np.finfo(float).tiny)
     if not ((share > _SHARE) & (share < 1)).any():
         return shares
-    effect = _effect_of_fast_parts(inputs, target, parts)
+    effect = effect_of_fast_parts(inputs, target, parts)
     silent = np.abs(effect) < _NO_EFFECT * np.abs(row)
     told = (share > _SHARE) & (share < 1) & silent
     shares[told] = share[told]
     return shares
 
 
-def _effect_of_fast_parts(inputs: Array, target: Array, parts: Sequence[slice]) -> Array:
+def effect_of_fast_parts(inputs: Array, target: Array, parts: Sequence[slice]) -> Array:
     """Coefficients of the target's second differences on those of the inputs, ``(input,)``."""
     table = np.zeros((0, inputs.shape[1] + 1))
     mean, count = np.zeros(table.shape[1]), 0
@@ -79,16 +76,23 @@ def _effect_of_fast_parts(inputs: Array, target: Array, parts: Sequence[slice]) 
 
 def _white(values: Array, parts: Sequence[slice]) -> float:
     """Variance of what is white in samples ``(sample,)`` of runs, by their differences."""
-    third = np.concatenate([np.diff(values[rows], n=3) for rows in parts])
-    noise = (_median_size(third) / _QUARTILE) ** 2 / _BINOMIAL
+    third = _median_size(lambda v: np.diff(v, n=3), values, parts)
+    noise = (third / _QUARTILE) ** 2 / _BINOMIAL
     # What is white must also be white over two steps; jumps and slow changes are not.
-    wide = np.concatenate([values[rows][2:] - values[rows][:-2] for rows in parts])
-    return float(min(noise, (_median_size(wide) / _QUARTILE) ** 2 / 2))
+    wide = _median_size(lambda v: v[2:] - v[:-2], values, parts)
+    return float(min(noise, (wide / _QUARTILE) ** 2 / 2))
 
 
-def _median_size(values: Array) -> float:
-    """Median of the absolute values, which are lost."""
-    return float(np.median(np.abs(values, out=values), overwrite_input=True))
+def _median_size(
+    differences: Callable[[Array], Array], values: Array, parts: Sequence[slice]
+) -> float:
+    """Median over all runs of how large differences are, in one array as long as `values`."""
+    sizes, count = np.empty(len(values)), 0
+    for rows in parts:
+        found = np.abs(differences(values[rows]))
+        sizes[count : count + len(found)] = found
+        count += len(found)
+    return float(np.median(sizes[:count], overwrite_input=True))
 
 
 def _partial_variance(inputs: Array, parts: Sequence[slice]) -> Array:

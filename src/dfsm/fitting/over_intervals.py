@@ -114,7 +114,7 @@ def _rows(
     *stacked, times = zip(*parts, strict=True)
     inputs, derivatives, weights = (np.concatenate(p) for p in stacked)
     alike = np.ptp(weights) <= _EQUAL * weights.mean()
-    none = {name: np.empty((0, 0)) for name in ("outputs", "harmonics", "field")}
+    none = {name: np.empty((0, 0)) for name in ("harmonics", "field")}
     return replace(
         samples,
         inputs=inputs,
@@ -122,6 +122,7 @@ def _rows(
         times=times,
         psi=np.empty(0),
         weights=None if alike else weights / weights.mean(),
+        recorded=(),
         steps=(),
         **none,
     )

@@ -16,10 +16,11 @@ def data_warnings(data: Dataset, settings: FitSettings, samples: Samples) -> lis
     """What a user should know about the data before trusting a fit, one sentence each."""
     doubts = [] if samples.terms is None else samples.terms.check(samples.columns)
     warnings = doubts + [text for name in settings.disturbances if (text := wind_warning(name))]
-    for c, values in zip(samples.signals.outputs, samples.outputs.T, strict=True):
-        if values.min() == values.max():
+    for k, c in enumerate(samples.signals.outputs):
+        low = min(values[:, k].min() for values in samples.recorded)
+        if low == max(values[:, k].max() for values in samples.recorded):
             warnings.append(
-                f"output '{c.name}' is {values[0]:g} throughout all training runs, and so in the "
+                f"output '{c.name}' is {low:g} throughout all training runs, and so in the "
                 "model: leave it out, or add runs in which it varies"
             )
     warnings += wrap_notes(data, (*settings.controls, *settings.driving, *settings.outputs))

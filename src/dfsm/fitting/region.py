@@ -13,6 +13,7 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
@@ -38,14 +39,16 @@ def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     order = samples.signals.order
     names = order.names
     steps = np.array([(data.channel(n).step or 0.0) if n in data.names else 0.0 for n in names])
-    bins, column = [np.arange(len(inputs))], model.schedule
+    bins, column = np.zeros(len(inputs), dtype=np.int8), model.schedule
+    operating = mean_over(inputs, weights)[None]
     if column is not None:
-        ranks = np.argsort(inputs[:, column], kind="stable")
-        bins = _equal_bins(ranks, weights)
-    each = [None if weights is None else weights[rows] for rows in bins]
-    operating = np.stack([mean_over(inputs[b], w) for b, w in zip(bins, each, strict=True)])
+        bins = _equal_bins(inputs[:, column], weights)
+        inside = [np.flatnonzero(bins == place) for place in range(int(bins.max()) + 1)]
+        each = [None if weights is None else weights[rows] for rows in inside]
+        operating = np.stack([mean_over(inputs[b], w) for b, w in zip(inside, each, strict=True)])
+        del inside
     fixed = np.r_[order.columns("disturbances"), order.columns("parameters")]
-    W, reach = whiten(inputs, samples.runs, bins, column, fixed, weights)
+    W, reach = whiten(inputs, samples.parts, bins, column, fixed, weights)
     return Region(
         low=jnp.asarray(inputs.min(axis=0) - steps),
         high=jnp.asarray(inputs.max(axis=0) + steps),
@@ -59,20 +62,25 @@ def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     )
 
 
-def _equal_bins(ranks: IntArray, weights: Array | None) -> list[IntArray]:
-    """Samples in the order of the schedule, in bins that are filled alike."""
+def _equal_bins(schedule: Array, weights: Array | None) -> NDArray[np.int8]:
+    """Bin of every sample, in the order of the schedule, so that all are filled alike."""
+    ranks = np.argsort(schedule, kind="stable")
     if weights is None:
-        return np.array_split(ranks, _OPERATING_POINTS)
-    ends = np.cumsum(weights[ranks])
-    shares = np.arange(1, _OPERATING_POINTS) / _OPERATING_POINTS
-    bins = np.split(ranks, np.searchsorted(ends, shares * ends[-1]))
-    return [rows for rows in bins if len(rows)]
+        parts = np.array_split(ranks, _OPERATING_POINTS)
+    else:
+        ends = np.cumsum(weights[ranks])
+        shares = np.arange(1, _OPERATING_POINTS) / _OPERATING_POINTS
+        parts = np.split(ranks, np.searchsorted(ends, shares * ends[-1]))
+    bins = np.zeros(len(schedule), dtype=np.int8)
+    for place, rows in enumerate(rows for rows in parts if len(rows)):
+        bins[rows] = place
+    return bins
 
 
 def whiten(
     inputs: Array,
-    runs: IntArray,
-    bins: Sequence[IntArray],
+    parts: Sequence[slice],
+    bins: NDArray[np.integer],
     schedule: int | None,
     first: IntArray,
     weights: Array | None = None,
@@ -83,10 +91,10 @@ def whiten(
     ----------
     inputs
         Training samples, shape ``(sample, input)``.
-    runs
-        Run of every sample, ``(sample,)``; runs one after the other.
+    parts
+        The samples of every run.
     bins
-        Samples of every operating point; one for all without a schedule.
+        Operating point of every sample, ``(sample,)``; one for all without a schedule.
     schedule
         Input column that schedules.
     first
@@ -104,14 +112,11 @@ def whiten(
     mean, std = mean_over(inputs, weights), std_over(inputs, weights)
     std = np.where(std > 0, std, 1.0)
     order = np.concatenate([first, np.delete(np.arange(len(std)), first)])
-    groups, bin_of = _groups(runs), np.zeros(len(inputs), dtype=np.int8)
-    for place, rows in enumerate(bins):
-        bin_of[rows] = place
+    groups, count = _groups(parts, len(inputs)), int(bins.max()) + 1
 
     def sums_of(group: slice) -> list[Array]:
-        z, own = (inputs[group] - mean) / std, bin_of[group]
-        w = None if weights is None else weights[group]
-        inside = [own == place for place in range(len(bins))]
+        z, w = (inputs[group] - mean) / std, None if weights is None else weights[group]
+        inside = [bins[group] == place for place in range(count)]
         return [_sums(z[rows], None if w is None else w[rows]) for rows in inside]
 
     # One group after the other: standardised samples would take as much memory again.
@@ -137,12 +142,12 @@ def _squared(z: Array, grid: Array, value: Array, middles: Array, W: Array) -> j
     return squared_distance(z, hats(grid, value), middles, W)
 
 
-def _groups(runs: IntArray) -> list[slice]:
+def _groups(parts: Sequence[slice], count: int) -> Sequence[slice]:
     """Parts of the data that are judged by the others: runs, or quarters of a single one."""
-    ends = (np.flatnonzero(np.diff(runs)) + 1).tolist()
-    if not ends:
-        ends = [-(-len(runs) * k // 4) for k in (1, 2, 3)]
-    return [slice(start, stop) for start, stop in pairwise([0, *ends, len(runs)]) if stop > start]
+    if len(parts) > 1:
+        return parts
+    ends = [-(-count * k // 4) for k in range(5)]
+    return [slice(start, stop) for start, stop in pairwise(ends) if stop > start]
 
 
 def _sums(z: Array, weights: Array | None) -> Array:

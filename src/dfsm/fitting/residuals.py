@@ -7,13 +7,14 @@ time of the residual. An average of both sides of ``ξ̇ = L I + r`` is as true 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from dfsm.core.types import Array, IntArray
+from dfsm.core.types import Array
 from dfsm.numerics.least_squares import correlation_length
+from dfsm.numerics.time_mesh import parts_of
 
 # Intervals per correlation time of the residual, and the most of them in all runs together.
 _PER_CORRELATION = 10
@@ -58,14 +59,14 @@ class Residuals:
 
 
 def residuals_of(
-    time: Array, runs: IntArray, inputs: Array, target: Array, left: Array
+    times: Sequence[Array], inputs: Array, target: Array, left: Array
 ) -> Residuals | None:
     """Average one row over intervals.
 
     Parameters
     ----------
-    time, runs
-        Of every sample, ``(sample,)``; runs one after the other.
+    times
+        Of the samples of every run, one after the other, each ``(time,)``.
     inputs, target, left
         As in `Residuals`, ``(sample, input)`` and ``(sample,)``.
 
@@ -74,17 +75,16 @@ def residuals_of(
     Residuals or None
         None where all runs are too short to tell anything: fewer than 4 intervals per input.
     """
-    parts = list(_split(runs))
-    step = sample = min(float(np.median(np.diff(time[part]))) for part in parts)
-    memory = float(np.mean([_memory(time[part], left[part]) for part in parts]))
-    together = sum(float(time[part][-1] - time[part][0]) for part in parts)
+    parts = list(zip(times, parts_of(times), strict=True))
+    step = sample = min(float(np.median(np.diff(time))) for time in times)
+    memory = float(np.mean([_memory(time, left[part]) for time, part in parts]))
+    together = sum(float(time[-1] - time[0]) for time in times)
     step = max(step, memory / _PER_CORRELATION, together / _MOST)
 
-    def means_of(part: slice) -> Array:
-        table = np.column_stack([inputs[part], target[part], left[part]])
-        return _means(time[part], table, step)
+    def means_of(time: Array, part: slice) -> Array:
+        return _means(time, np.column_stack([inputs[part], target[part], left[part]]), step)
 
-    means = [m for part in parts if len(m := means_of(part))]
+    means = [m for time, part in parts if len(m := means_of(time, part))]
     if sum(len(m) for m in means) < 4 * (inputs.shape[1] + 1):
         return None
     return Residuals(
@@ -94,12 +94,6 @@ def residuals_of(
         tuple(m[:, -1] for m in means),
         sample,
     )
-
-
-def _split(runs: IntArray) -> Iterator[slice]:
-    ends = np.flatnonzero(np.diff(runs, append=-1)) + 1
-    for start, stop in zip([0, *ends[:-1]], ends, strict=True):
-        yield slice(start, stop)
 
 
 def _memory(time: Array, left: Array) -> float:

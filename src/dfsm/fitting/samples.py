@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -47,7 +46,7 @@ from dfsm.models.signals import (
     with_computed,
 )
 from dfsm.models.terms import Terms, terms_of
-from dfsm.numerics.time_mesh import same_instant, weights_over_time
+from dfsm.numerics.time_mesh import parts_of, same_instant, weights_over_time
 
 # Share by which the recorded azimuth may turn faster or slower than the speed says.
 _SAME_SPEED = 0.05
@@ -59,12 +58,13 @@ class Samples:
 
     Attributes
     ----------
-    inputs, derivatives, outputs, harmonics
-        I, Ẋ, Y and the blade-passing harmonics without a field, shapes ``(sample, n)``.
+    inputs, derivatives, harmonics
+        I, Ẋ and the blade-passing harmonics without a field, shapes ``(sample, n)``.
     field
         Harmonics of the wind field, `SignalTable.field`, shape ``(sample, n)``.
-    times
-        Times in s of every run, each ``(time,)``.
+    times, recorded
+        Times in s and outputs of every run, ``(time,)`` and ``(time, output)``: parts of the data
+        where they can be, since many runs would not fit into memory twice.
     psi
         Recorded azimuth in rad, which goes on growing after a turn (zero without), ``(sample,)``.
     signals
@@ -85,10 +85,10 @@ class Samples:
 
     inputs: Array
     derivatives: Array
-    outputs: Array
     harmonics: Array
     field: Array
     times: tuple[Array, ...]
+    recorded: tuple[Array, ...]
     psi: Array
     signals: SignalTable
     derivative_names: tuple[tuple[str, str], ...]
@@ -96,6 +96,11 @@ class Samples:
     weights: Array | None = None
     steps: tuple[Steps, ...] = ()
     rough: tuple[str, ...] = ()
+
+    @property
+    def outputs(self) -> Array:
+        """Y, ``(sample, output)``."""
+        return np.concatenate(self.recorded)
 
     @property
     def time(self) -> Array:
@@ -110,8 +115,7 @@ class Samples:
     @property
     def parts(self) -> list[slice]:
         """The samples of every run."""
-        ends = np.cumsum([0, *(len(time) for time in self.times)]).tolist()
-        return [slice(start, stop) for start, stop in pairwise(ends)]
+        return parts_of(self.times)
 
     @property
     def linear_inputs(self) -> Array:
@@ -239,6 +243,7 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
     ]
     kinked = "hold" in bends or any(same_instant(run.time).any() for run in data)
     tables, times, begin = _places(data, settings), list[Array](), 0
+    recorded: list[Array] = []
     labels: tuple[tuple[str, str], ...] = ()
     for whole_run in track(data, "derivatives"):
         run = lead_in(whole_run, settings.start, settings.derivatives)
@@ -251,8 +256,9 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
-        # Of the data where it can be: many runs would not fit into memory twice.
-        times.append(run.window(known_from(whole_run, settings), settings.stop).time)
+        seen = run.window(known_from(whole_run, settings), settings.stop)
+        times.append(seen.time)
+        recorded.append(_columns(seen, settings.outputs))
         place = slice(begin, begin := begin + len(times[-1]))
         azimuth = settings.azimuth
         if azimuth is not None:
@@ -266,13 +272,13 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
             steps.append(Steps.of(extracted, rows, inputs, settings.states, len(signals.driving)))
         tables["inputs"][place] = inside.select(order.names).values
         tables["derivatives"][place] = extracted.derivatives[rows]
-        tables["outputs"][place] = run.select(settings.outputs).values[rows]
         tables["field"][place] = run.select(azimuth.field if azimuth else ()).values[rows]
     inputs = tables["inputs"]
     require_moving(settings.states, inputs[:, signals.observed_columns])
     return Samples(
         **tables,
         times=tuple(times),
+        recorded=tuple(recorded),
         signals=signals,
         derivative_names=labels,
         terms=terms_of(settings.terms, signals.inputs, inputs),
@@ -280,6 +286,15 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         steps=tuple(steps),
         rough=rough,
     )
+
+
+def _columns(run: Trajectory, names: Sequence[str]) -> Array:
+    """Channels ``(time, channel)`` of a run, a part of it where they lie side by side."""
+    columns = run.columns(names)
+    first = columns[0] if columns else 0
+    if columns == list(range(first, first + len(columns))):
+        return run.values[:, first : first + len(columns)]
+    return run.values[:, columns]
 
 
 def _places(data: Dataset, settings: FitSettings) -> dict[str, Array]:
@@ -294,7 +309,6 @@ def _places(data: Dataset, settings: FitSettings) -> dict[str, Array]:
     widths = {
         "inputs": driving + states,
         "derivatives": states,
-        "outputs": len(settings.outputs),
         "harmonics": blades,
         "field": len(azimuth.field) if azimuth else 0,
     }

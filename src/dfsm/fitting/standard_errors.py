@@ -13,11 +13,11 @@ make good for; where none is left, nothing is known.
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Sequence
 
 import numpy as np
 
-from dfsm.core.types import Array, IntArray
+from dfsm.core.types import Array
 from dfsm.numerics.least_squares import correlation_length
 from dfsm.numerics.time_mesh import std_over
 
@@ -26,7 +26,7 @@ _PER_MEMORY = 10
 _STENCIL = 4.0
 
 
-def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
+def standard_errors(inputs: Array, left: Array, parts: Sequence[slice]) -> Array:
     """Standard errors of the coefficients of one row.
 
     Parameters
@@ -35,8 +35,8 @@ def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
         ``(sample, input)``.
     left
         What the fit of all samples leaves over, ``(sample,)``.
-    runs
-        Run of every sample; each is one time series, taken as equidistant.
+    parts
+        The samples of every run, a time series each, taken as equidistant.
 
     Returns
     -------
@@ -54,8 +54,6 @@ def standard_errors(inputs: Array, left: Array, runs: IntArray) -> Array:
     def standardised(rows: slice) -> Array:
         return (inputs[rows] - mean)[:, varies] / scale[varies]
 
-    ends = [0, *(np.flatnonzero(np.diff(runs)) + 1).tolist(), len(runs)]
-    parts = [slice(start, stop) for start, stop in pairwise(ends)]
     products = np.zeros((count, count))
     for rows in parts:
         x = standardised(rows)

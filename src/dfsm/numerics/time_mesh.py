@@ -176,6 +176,12 @@ def weights_over_time(times: Sequence[Series]) -> Series | None:
     return weights / weights.mean()
 
 
+def parts_of(times: Sequence[Series]) -> list[slice]:
+    """The samples of every run ``(time,)`` among those of all, one run after the other."""
+    ends = np.cumsum([0, *(len(time) for time in times)]).tolist()
+    return [slice(start, stop) for start, stop in pairwise(ends)]
+
+
 def mean_over(values: np.ndarray, weights: Series | None) -> np.ndarray:
     """Mean over samples ``(sample, ...)`` with weights ``(sample,)``; None takes all alike."""
     if weights is None:
