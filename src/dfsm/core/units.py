@@ -31,6 +31,8 @@ _ENERGY = {"kg": 1.0, "m": 2.0, "s": -2.0}
 _POWER = {"kg": 1.0, "m": 2.0, "s": -3.0}
 _VOLTAGE = _POWER | {"A": -1.0}
 
+_BASES = {*("m", "s", "rad", "kg", "K", "A", "mol", "VA", "var", "cd")}
+
 # Units that take a prefix: what one is in m, s, rad, kg, K and A, and its powers of these. Angles
 # have a dimension of their own: a speed of rotation is no frequency, though both are "per second".
 _PREFIXABLE: dict[str, tuple[float, _Powers]] = {
@@ -135,6 +137,11 @@ class Unit:
 def known(text: str) -> bool:
     """Whether a text says anything about the unit."""
     return _bare(text).lower() not in _UNKNOWN
+
+
+def listed(text: str) -> bool:
+    """Whether a text is a unit of the table here, or made of some: a word of its own is none."""
+    return known(text) and all(base in _BASES for base, _ in _read(_bare(text)).powers)
 
 
 def conversion(source: str, target: str) -> tuple[float, float] | None:

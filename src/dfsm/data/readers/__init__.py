@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 OPENFAST = {".outb", ".out", ".dbg", ".dbg2", ".dbg3"}
-TABLES = {".csv", ".txt", ".tsv", ".parquet", ".pq", ".mat", ".hdf5", ".h5"}
+TABLES = {".csv", ".txt", ".tsv", ".lvm", ".asc", ".parquet", ".pq", ".mat", ".hdf5", ".h5"}
 # How files begin that are recognised under any name.
 SIGNATURES = {b"PAR1": read_table, b"MATLAB": read_table, b"\x89HDF": read_table} | {
     bytes([n, 0]): read_openfast for n in (1, 2, 3, 4)
@@ -59,8 +59,8 @@ def read(path: str | Path, step: float | None = None) -> Trajectory:
     ----------
     path
         OpenFAST `.outb` or `.out`, ROSCO `.RO.dbg`, HAWC2 `.sel` or `.hdf5`, Bladed `.%NN` or
-        `.$PJ`, `.csv` (`.txt`, `.tsv`), `.parquet` or `.mat`; under another name, binary files are
-        recognised by their first bytes.
+        `.$PJ`, `.csv` (`.txt`, `.tsv`, `.asc`), LabVIEW `.lvm`, `.parquet` or `.mat`; under
+        another name, binary files are recognised by their first bytes.
     step
         Interval between samples in s for tables that hold no time.
 

@@ -20,18 +20,23 @@ from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
     ALSO_TIME,
-    SECONDS,
     TIME_NAMES,
     kept_columns,
     no_time,
     rate_step,
     since_1970,
-    split_header,
     time_column,
     uniform_times,
 )
 from dfsm.data.readers.decimals import with_points
 from dfsm.data.readers.guard import unguarded
+from dfsm.data.readers.labels import (
+    count_labels,
+    label_rows,
+    named_channels,
+    without_more_times,
+)
+from dfsm.data.readers.lvm import TITLE, read_lvm
 from dfsm.data.readers.stamps import is_stamp
 from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
 from dfsm.data.trajectory import Channel, Trajectory
@@ -45,7 +50,6 @@ _STAMP_NAMES = (
     "zeitstempel",
 )
 _NAME_AND_UNIT = re.compile(r"\S+?[ _]?(?:\([^()]*\)|\[[^\[\]]*\])|\S+")
-_UNITS = re.compile(r"\([^()]*\)|\[[^\[\]]*\]|\S+")
 _RATE = re.compile(
     r"((?:[^\W\d]\w*[ _])?[^\W\d]\w*)\s*[=:,;\t]\s*([-+]?[.\d][.\deE+-]*) *([^\s,;]*)"
 )
@@ -71,17 +75,19 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
         No table, no time and no rate, or rows that do not fit.
     """
     text = decode(path, "a CSV table")
+    if text.startswith(TITLE):
+        return read_lvm(path, text)
     lines = text.split("\n")
     header = _find_header(lines)
     if header is None:
         raise DfsmError(f"{path} holds blank lines only: check that it is the right file")
     rows, commas = with_points(path, _rows(path, lines, header), header.separator)
-    channels = [Channel(*split_header(unguarded(cell))) for cell in header.names]
-    if rows and (units := _units_row(lines, rows[0], header, channels)):
-        channels = [
-            Channel(c.name, c.unit or _bare(u)) for c, u in zip(channels, units, strict=True)
-        ]
-        rows = rows[1:]
+    channels = named_channels([unguarded(cell) for cell in header.names])
+    labels = rows[: count_labels(rows, channels)]
+    units, words = label_rows(labels, lines, header.at, channels, header.separator == _BLANKS)
+    if units:
+        channels = [Channel(c.name, c.unit or u) for c, u in zip(channels, units, strict=True)]
+        rows = rows[len(labels) :]
     time = _time(path, channels, rows)
     layout = Layout(
         path=path,
@@ -104,6 +110,8 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
             name = channels[time].name
             note = f"'{name}' counts {what} since 1970: times are seconds since the first"
     keep, notes = kept_columns(path, channels, columns, rate)
+    if time is not None:
+        keep, notes = without_more_times(path, channels, columns, time, (keep, notes))
     for j in table.words:
         if j in keep and rows:
             keep.remove(j)
@@ -111,7 +119,7 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
             notes.append(f"column '{channels[j].name}' left out: it holds words ('{example}')")
     if table.stamps is not None and time is not None:
         note = table.stamps.note(channels[time].name)
-    notes += [text for text in (note, commas) if text]
+    notes += [text for text in (note, commas, words) if text]
     values = np.stack([columns[i] for i in keep], axis=1) if keep else np.empty((len(told), 0))
     return assemble(path, told, values, [channels[i] for i in keep], notes=(*table.notes, *notes))
 
@@ -133,7 +141,8 @@ def _find_header(lines: list[str]) -> _Header | None:
         comment = _is_comment(line)
         names = line.lstrip(" " + "".join(_COMMENTS)) if comment else line
         header = _header(i, names, separators)
-        if not _names_time(header.names):
+        # "Time" beside a time of day is what is told of a measurement, no name of a column.
+        if not _names_time(header.names) or any(map(is_stamp, header.names)):
             continue
         first = plain and i == plain[0][0] and not comment
         below = next((text for j, text in plain if j > i), None)
@@ -167,7 +176,7 @@ def _is_comment(line: str) -> bool:
 
 def _names_time(names: list[str]) -> bool:
     known = (*TIME_NAMES, *ALSO_TIME, *_STAMP_NAMES)
-    return any(split_header(name)[0].lower() in known for name in names)
+    return any(c.name.lower() in known for c in named_channels(names))
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -192,27 +201,6 @@ def _rows(path: Path, lines: list[str], header: _Header) -> list[Row]:
     except csv.Error as error:
         line = numbered[min(reader.line_num, len(numbered)) - 1][0]
         raise DfsmError(f"{path}, line {line}: {error}; it is no CSV table") from None
-
-
-def _units_row(
-    lines: list[str], row: Row, header: _Header, channels: list[Channel]
-) -> list[str] | None:
-    """Units below the names: texts in brackets, or the time's unit in its place."""
-    cells = row.cells
-    if header.separator == _BLANKS:
-        cells = _UNITS.findall(lines[row.line - 1])
-    if len(cells) != len(channels) or any(number(c) is not None and c.strip() for c in cells):
-        return None
-    bracketed = any(re.fullmatch(r"\s*(\(.*\)|\[.*\])\s*", c) for c in cells)
-    seconds = any(
-        c.name.lower() in (*TIME_NAMES, *ALSO_TIME) and u.strip() and u.strip().lower() in SECONDS
-        for c, u in zip(channels, cells, strict=True)
-    )
-    return cells if bracketed or seconds else None
-
-
-def _bare(unit: str) -> str:
-    return unit.strip().strip("()[]").strip()
 
 
 # -- time ---------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ def read_table(path: str | Path, step: float | None = None) -> Trajectory:
 
     * CSV: the first row holds names, with units as ``PtfmPitch [deg]``, ``PtfmPitch (deg)`` or
       ``PtfmPitch_[deg]``, or in a row below; separated by comma, semicolon, tab or blanks; lines
-      that begin with ``#`` are comments; empty cells and stars are NaN.
+      that begin with ``#`` are comments; empty cells and stars are NaN. LabVIEW's `.lvm` too.
     * Parquet: what `write_table` wrote, or any table with a time column or a float index.
     * MAT (v7.3 with ``dfsm[hdf5]``): a time vector and vectors or matrices as long, in structs of
       any depth, or `Channels`, `ChanName` and `ChanUnit` as MATLAB's ``ReadFASTbinary`` returns
