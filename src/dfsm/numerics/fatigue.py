@@ -8,7 +8,9 @@ import fatpack
 import numpy as np
 
 from dfsm.core.shapes import Series
+from dfsm.core.types import Array
 from dfsm.errors import DfsmError
+from dfsm.numerics.rainflow import four_point_cycles
 
 WOHLER_EXPONENTS = (3.0, 4.0, 5.0, 10.0)
 
@@ -73,9 +75,22 @@ def _damage_equivalent_loads(
     # fatpack alone loses the largest cycle of a history that begins or ends at an extreme.
     peak = int(np.argmax(values))
     closed = np.concatenate([values[peak:], values[: peak + 1]])
-    ranges = np.asarray(fatpack.find_rainflow_ranges(closed, k=256))
+    ranges = _ranges(fatpack.find_reversals(closed, k=256)[0])
     # Divided by the largest range before the power, or m = 10 overflows in N m.
     largest = ranges.max()
     cycles = frequency * duration
     damages = [(m, np.sum((ranges / largest) ** m) / cycles) for m in exponents]
     return [float(largest * damage ** (1 / m)) for m, damage in damages]
+
+
+def _ranges(reversals: Array) -> Array:
+    """Ranges of all cycles of a history, those that remain open closed by its repetition.
+
+    As `fatpack.find_rainflow_ranges` has them and in its order, several times faster.
+    """
+    pairs, kept = four_point_cycles(reversals.tolist())
+    rest = np.asarray(fatpack.concatenate_reversals(reversals[kept], reversals[kept]))
+    again, _ = four_point_cycles(rest.tolist())
+    parts = [(reversals, pairs), (rest, again)]
+    ends = [values[np.array(found, dtype=np.int64).reshape(-1, 2)] for values, found in parts]
+    return np.abs(np.diff(np.concatenate(ends), axis=1))[:, 0]

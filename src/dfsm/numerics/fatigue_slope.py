@@ -6,6 +6,7 @@ import numpy as np
 
 from dfsm.core.shapes import Series
 from dfsm.core.types import Array, IntArray
+from dfsm.numerics.rainflow import four_point_cycles
 
 
 def rainflow_cycles(values: Series) -> IntArray:
@@ -29,18 +30,7 @@ def rainflow_cycles(values: Series) -> IntArray:
     first = int(np.argmax(values))
     order = np.concatenate([np.arange(first, len(values)), np.arange(first + 1)])
     at = order[_turns(values[order])]
-    loads = values[at].tolist()
-    kept: list[int] = []
-    pairs: list[tuple[int, int]] = []
-    for i, load in enumerate(loads):
-        while len(kept) >= 3:
-            a, b, c = (loads[k] for k in kept[-3:])
-            inner = abs(c - b)
-            if inner > abs(b - a) or inner > abs(load - c):
-                break
-            pairs.append((kept[-2], kept[-1]))
-            del kept[-2:]
-        kept.append(i)
+    pairs, kept = four_point_cycles(values[at].tolist())
     # What is left is the maximum, the minimum and the maximum again: one cycle.
     if len(kept) >= 2:
         pairs.append((kept[0], kept[1]))
