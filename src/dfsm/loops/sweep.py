@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from dfsm.controllers.tunable import tunable
 from dfsm.core.drawing import Drawn
 from dfsm.core.files import json_value
 from dfsm.core.settings import require, settings_class
+from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
@@ -22,7 +24,7 @@ from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.extremes import block_maxima, extrapolated, fit_gumbel
-from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loops
+from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, reduced_loops
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 
 if TYPE_CHECKING:
@@ -228,14 +230,14 @@ def sweep(
         raise DfsmError(f"settings: the model has {missing(lost, units)}")
     runs = [completed(run, s) for run in runs]
     with hushed():
-        rolled = closed_loops(
+        rolled = reduced_loops(
             model,
             runs,
             list(controllers.values()),
+            partial(_Loop.of, settings),
             window=(settings.start, settings.stop),
             measurements=measurements,
             settings=settings.loop,
-            watched=False,
         )
     loops = dict(zip(controllers, rolled, strict=True))
     swept = tuple(_swept(n, loops[n], weights, settings, units) for n in controllers)
@@ -277,35 +279,73 @@ def gain_grid(
     return found
 
 
+@dataclass(frozen=True)
+class _Loop:
+    """What a sweep keeps of one closed loop.
+
+    Attributes
+    ----------
+    span
+        First and last time in s.
+    ending
+        One sentence, if it ended early.
+    figures
+        By channel; None if it ended early.
+    maxima
+        Of blocks, by channel, of those that are extrapolated.
+    """
+
+    span: tuple[float, float]
+    ending: str | None
+    figures: Mapping[str, Figures] | None
+    maxima: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, settings: SweepSettings, loop: ClosedLoopRun) -> _Loop:
+        """All that is asked of it."""
+        run = loop.trajectory
+        span = (float(run.time[0]), float(run.time[-1]))
+        if loop.status is not LoopStatus.COMPLETED:
+            return cls(span, f"{run.name}: {loop.message}", None, {})
+        return cls(span, None, case_figures(run), _maxima(run, settings))
+
+
+def _maxima(run: Trajectory, settings: SweepSettings) -> dict[str, Array]:
+    found = {}
+    for name in settings.extremes:
+        if name in run:
+            try:
+                found[name] = block_maxima(run.time, run[name], settings.block)
+            except DfsmError as error:
+                raise DfsmError(f"extremes of {name}: {error}") from None
+    return found
+
+
 def _swept(
     name: str,
-    loops: Sequence[ClosedLoopRun],
+    loops: Sequence[_Loop],
     weights: Sequence[float],
     settings: SweepSettings,
     units: Mapping[str, str],
 ) -> Swept:
-    done = [r.status is LoopStatus.COMPLETED for r in loops]
-    figures = tuple(
-        case_figures(r.trajectory) if ok else None for r, ok in zip(loops, done, strict=True)
-    )
-    endings = tuple(
-        f"{r.trajectory.name}: {r.message}" for r, ok in zip(loops, done, strict=True) if not ok
-    )
+    figures = tuple(loop.figures for loop in loops)
+    endings = tuple(loop.ending for loop in loops if loop.ending is not None)
     swept = _over_all(name, figures, endings, weights, settings, units)
-    return replace(swept, extremes=_extremes([r.trajectory for r in loops], weights, settings)
-                   if all(done) else {})  # fmt: skip
+    if endings:
+        return swept
+    return replace(swept, extremes=_extremes([lp.maxima for lp in loops], weights, settings))
 
 
 def _extremes(
-    runs: Sequence[Trajectory], weights: Sequence[float], settings: SweepSettings
+    maxima: Sequence[Mapping[str, Array]], weights: Sequence[float], settings: SweepSettings
 ) -> dict[str, Extreme]:
     """Long-term extremes of the channels that all runs hold."""
     found = {}
     for name in settings.extremes:
-        if any(name not in run for run in runs):
+        if any(name not in of_run for of_run in maxima):
             continue
         try:
-            fits = [fit_gumbel(block_maxima(r.time, r[name], settings.block)) for r in runs]
+            fits = [fit_gumbel(of_run[name]) for of_run in maxima]
         except DfsmError as error:
             raise DfsmError(f"extremes of {name}: {error}") from None
         blocks = settings.years * HOURS_PER_YEAR * 3600 / settings.block
@@ -316,21 +356,21 @@ def _extremes(
 
 def _recorded(
     runs: Sequence[Trajectory],
-    rolled: Sequence[Sequence[ClosedLoopRun]],
+    rolled: Sequence[Sequence[_Loop]],
     weights: Sequence[float],
     settings: SweepSettings,
     units: Mapping[str, str],
 ) -> Swept:
     """The record over the time that is scored."""
     names = [n for n in units if all(n in run for run in runs)]
-    figures, parts = [], []
+    figures, maxima = [], []
     for i, run in enumerate(runs):
-        done = [r[i].trajectory for r in rolled if r[i].status is LoopStatus.COMPLETED]
-        ends = (float(done[0].time[0]), float(done[0].time[-1])) if done else (None, None)
-        parts.append(run.window(*ends).select(names))
-        figures.append(case_figures(parts[-1]))
+        done = [loops[i].span for loops in rolled if loops[i].ending is None]
+        part = run.window(*(done[0] if done else (None, None))).select(names)
+        figures.append(case_figures(part))
+        maxima.append(_maxima(part, settings))
     swept = _over_all(RECORDED, tuple(figures), (), weights, settings, units)
-    return replace(swept, extremes=_extremes(parts, weights, settings))
+    return replace(swept, extremes=_extremes(maxima, weights, settings))
 
 
 def _over_all(

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 import equinox as eqx
 import jax
@@ -39,6 +39,9 @@ from dfsm.simulation.loop_cases import (
 )
 from dfsm.simulation.outcome import ESCAPE, MUCH_OUTSIDE
 from dfsm.simulation.wires import Wires, connect, not_commanded
+
+# What is kept of a closed loop.
+Reduced = TypeVar("Reduced")
 
 
 class LoopStatus(enum.Enum):
@@ -197,7 +200,6 @@ def closed_loops(
     window: tuple[float | None, float | None] = (None, None),
     measurements: Mapping[str, str] | None = None,
     settings: ClosedLoopSettings | None = None,
-    watched: bool = True,
 ) -> list[list[ClosedLoopRun]]:
     """Close the loop with each of several controllers over each of several runs.
 
@@ -211,8 +213,6 @@ def closed_loops(
         Any number.
     window
         Start and stop of what is scored in s.
-    watched
-        Whether to tell how long loops are outside the training range.
 
     Returns
     -------
@@ -224,41 +224,80 @@ def closed_loops(
     DfsmError
         As `closed_loop`.
     """
-    settings = settings or ClosedLoopSettings()
-    wires = [connect(model, controller, measurements) for controller in controllers]
-    intervals = {float(c.interval) for c in controllers}
-    cases = {i: prepared_cases(model, runs, i, window, settings) for i in intervals}
-    ready, begin = model.stripped(), clock.perf_counter()
-    rollers = [
-        (i, float(c.interval), _roller(ready, wires[i], c, watched))
-        for i, c in enumerate(controllers)
-    ]
-    cores = os.cpu_count() or 1
+    begin = clock.perf_counter()
+    batch = _Batch(model, runs, controllers, measurements, window, settings)
+    results = batch.each(lambda run: run, watched=True)
+    wall = (clock.perf_counter() - begin) / max(1, len(runs) * len(controllers))
+    return [[replace(run, wall_time=wall) for run in of_one] for of_one in results]
 
-    @lru_cache(maxsize=2 * cores)
-    def drive(interval: float, run: int) -> Drive:
-        case = cases[interval][run]
-        return padded(case, enough_calls(case))
 
-    # All controllers of a run after one another, so that its drive is made once and not kept.
-    tasks = [
-        (i, run, partial(rolled, cases[interval][run], partial(drive, interval, run)))
-        for run in range(len(runs))
-        for i, interval, rolled in rollers
-    ]
-    results: dict[tuple[int, int], ClosedLoopRun] = {}
-    # XLA keeps a loop on one core, and one that holds several controllers side by side costs more
-    # than these in turn; libraries wait in processes of their own.
-    with ThreadPoolExecutor(cores) as pool:
-        paths = pool.map(lambda task: task[2](), tasks)
-        for (i, run, _), path in zip(tasks, paths, strict=True):
-            case = cases[float(controllers[i].interval)][run]
-            results[i, run] = result_of(model, wires[i], controllers[i], case, path)
-    wall = (clock.perf_counter() - begin) / max(1, len(results))
-    return [
-        [replace(results[i, run], wall_time=wall) for run in range(len(runs))]
-        for i in range(len(controllers))
-    ]
+def reduced_loops(
+    model: DFSM,
+    runs: Sequence[Trajectory],
+    controllers: Sequence[Controller],
+    reduce: Callable[[ClosedLoopRun], Reduced],
+    *,
+    window: tuple[float | None, float | None] = (None, None),
+    measurements: Mapping[str, str] | None = None,
+    settings: ClosedLoopSettings | None = None,
+) -> list[list[Reduced]]:
+    """As `closed_loops`, of which only what `reduce` makes of each loop is kept.
+
+    Parameters
+    ----------
+    model, runs, controllers, window, measurements, settings
+        As for `closed_loops`.
+    reduce
+        Called in threads as soon as a loop is closed. How long it is outside the training range
+        is not a number.
+    """
+    return _Batch(model, runs, controllers, measurements, window, settings).each(reduce)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Closed loops of several controllers over several runs."""
+
+    model: DFSM
+    runs: Sequence[Trajectory]
+    controllers: Sequence[Controller]
+    measurements: Mapping[str, str] | None
+    window: tuple[float | None, float | None]
+    settings: ClosedLoopSettings | None
+
+    def each(
+        self, reduce: Callable[[ClosedLoopRun], Reduced], watched: bool = False
+    ) -> list[list[Reduced]]:
+        """What `reduce` makes of every loop, per controller in the order of the runs."""
+        model, controllers, count = self.model, self.controllers, len(self.runs)
+        settings = self.settings or ClosedLoopSettings()
+        wires = [connect(model, controller, self.measurements) for controller in controllers]
+        intervals = [float(c.interval) for c in controllers]
+        cases = {
+            i: prepared_cases(model, self.runs, i, self.window, settings) for i in set(intervals)
+        }
+        ready, cores = model.stripped(), os.cpu_count() or 1
+        pairs = zip(wires, controllers, strict=True)
+        rollers = [_roller(ready, its, controller, watched) for its, controller in pairs]
+
+        @lru_cache(maxsize=2 * cores)
+        def drive(interval: float, run: int) -> Drive:
+            case = cases[interval][run]
+            return padded(case, enough_calls(case))
+
+        def closed(task: tuple[int, int]) -> Reduced:
+            run, i = task
+            case = cases[intervals[i]][run]
+            path = rollers[i](case, partial(drive, intervals[i], run))
+            return reduce(result_of(model, wires[i], controllers[i], case, path))
+
+        # All controllers of a run after one another, so that its drive is made once and not kept.
+        # XLA keeps a loop on one core, and one that holds several controllers side by side costs
+        # more than these in turn; libraries wait in processes of their own.
+        tasks = [(run, i) for run in range(count) for i in range(len(controllers))]
+        with ThreadPoolExecutor(cores) as pool:
+            found = dict(zip(tasks, pool.map(closed, tasks), strict=True))
+        return [[found[run, i] for run in range(count)] for i in range(len(controllers))]
 
 
 def _roller(
