@@ -15,6 +15,7 @@ from dfsm.control.mesh.grid import Grid
 from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Replay
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.between import polynomials
 from dfsm.data.trajectory import Trajectory
@@ -52,7 +53,7 @@ def replay(problem: OptimalControlProblem, grid: Grid, start: Start, scenario: i
     size = np.abs(X).max(axis=0)
     size = np.where(size > 0, size, 1.0)
     shared = [*start.p, *([start.stop] if problem.free_time is not None else [])]
-    p, _ = functions.unpack(jnp.asarray(shared), common_of(problem))
+    p, _ = functions.unpack(from_host(shared), common_of(problem))
     ends = _integrate(
         functions.plant.derivative,
         _pieces(grid, U),

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.channel import Channel
 from dfsm.errors import DfsmError
@@ -80,13 +81,13 @@ class DFSMComp(om.ExplicitComponent):
 
     def compute(self, inputs: Any, outputs: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Evaluate f̂ and ĝ at all nodes."""
-        values = np.asarray(_values(self.options["model"], jnp.asarray(self._points(inputs))))
+        values = np.asarray(_values(self.options["model"], from_host(self._points(inputs))))
         for name, column in zip(self._of, values.T, strict=True):
             outputs[name] = column
 
     def compute_partials(self, inputs: Any, partials: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Evaluate the exact Jacobians at all nodes."""
-        slopes = np.asarray(_slopes(self.options["model"], jnp.asarray(self._points(inputs))))
+        slopes = np.asarray(_slopes(self.options["model"], from_host(self._points(inputs))))
         for i, j, of, wrt in self._pairs:
             partials[of, wrt] = slopes[:, i, j]
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.exports.program import Program, Recorder
 
@@ -65,7 +65,7 @@ def translated(function: Callable[..., jax.Array], inputs: Sequence[tuple[str, i
     UntranslatableError
         It uses a primitive that a program has no steps for.
     """
-    closed = jax.make_jaxpr(function)(*(jnp.zeros(size) for _, size in inputs))
+    closed = jax.make_jaxpr(function)(*(from_host(np.zeros(size)) for _, size in inputs))
     translator = Translator(Recorder(inputs))
     arguments = [Traced((size,), k) for k, (_, size) in enumerate(inputs)]
     (result,) = translator.run(closed, arguments)
@@ -247,7 +247,7 @@ def computed(equation: Any, operands: Sequence[Any]) -> list[Value]:
     """What an equation gives for known operands."""
     if equation.primitive.name in MOVES and len(operands):
         return [MOVES[equation.primitive.name](equation.params, *operands)]
-    results = equation.primitive.bind(*(jnp.asarray(v) for v in operands), **equation.params)
+    results = equation.primitive.bind(*(from_host(v) for v in operands), **equation.params)
     several = equation.primitive.multiple_results
     return [np.asarray(r) for r in (results if several else [results])]
 

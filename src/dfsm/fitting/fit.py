@@ -15,11 +15,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from dfsm.core.hand_back import hand_back
+from dfsm.core.host import from_host
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
@@ -252,8 +252,8 @@ def _fit_derivatives(samples: Samples, settings: FitSettings) -> LinearFit:
         L[:, row, columns.start + rate] = 1.0
     model = LinearModel(
         result.model.grid,
-        jnp.asarray(L),
-        jnp.asarray(b),
+        from_host(L),
+        from_host(b),
         result.model.schedule,
         tuple((fitted[row], column) for row, column in result.model.known),
     )
@@ -361,8 +361,9 @@ def _fit_nonlinear(samples: Samples, rows: Samples, region: Region, settings: Fi
         )
         if trained is None:
             raise ValueError("nothing to fit")
-        zero = jnp.zeros((1, targets.shape[1], inputs.shape[1]))
-        return LinearModel(jnp.zeros(1), zero, jnp.asarray(mean)[None], None), trained.function
+        zero = np.zeros((1, targets.shape[1], inputs.shape[1]))
+        grid, L, b = map(from_host, (np.zeros(1), zero, mean[None]))
+        return LinearModel(grid, L, b, None), trained.function
 
     f, e = part(rows, rows.inputs, rows.derivatives)
     inputs = samples.without_terms(samples.output_inputs)

@@ -18,10 +18,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 from dfsm.core.settings import settings_class
 from dfsm.core.types import Array, IntArray
 from dfsm.errors import DfsmError, near_matches
@@ -259,9 +259,9 @@ def fit_linear(
     counts, mass = np.array([e.count for e in sums]), np.array([e.weight for e in sums])
     grid = schedule_sums / mass if lpv else np.zeros(1)
     model = LinearModel(
-        grid=jnp.asarray(grid),
-        coefficients=jnp.asarray(np.stack([s.coefficients for s in solutions])),
-        offsets=jnp.asarray(np.stack([s.offset for s in solutions])),
+        grid=from_host(grid),
+        coefficients=from_host(np.stack([s.coefficients for s in solutions])),
+        offsets=from_host(np.stack([s.offset for s in solutions])),
         schedule=column,
         known=tuple(known),
     )

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
 from dfsm.errors import DfsmError
@@ -222,7 +222,7 @@ def fit_passing(
                 C[factor, i, part * n + first + place] = c[:, i]
             first += width
         accounts.append(_account(multiples, chosen, i))
-    passing = Passing(jnp.asarray(C), jnp.asarray(speed), jnp.asarray(ends), column)
+    passing = Passing(from_host(C), from_host(speed), from_host(ends), column)
     notes = _overfilled(multiples.get(azimuth.blades), azimuth.blades, samples)
     return replace(model, passing=passing), accounts, notes
 

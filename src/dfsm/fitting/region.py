@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
 from dfsm.fitting.samples import Samples
@@ -50,13 +50,13 @@ def region_of(samples: Samples, model: LinearModel, data: Dataset) -> Region:
     fixed = np.r_[order.columns("disturbances"), order.columns("parameters")]
     W, reach = whiten(inputs, samples.parts, bins, column, fixed, weights)
     return Region(
-        low=jnp.asarray(inputs.min(axis=0) - steps),
-        high=jnp.asarray(inputs.max(axis=0) + steps),
-        mean=jnp.asarray(mean_over(inputs, weights)),
-        std=jnp.asarray(std_over(inputs, weights)),
-        grid=jnp.asarray(operating[:, column or 0]),
-        operating=jnp.asarray(operating),
-        whitening=jnp.asarray(W / reach),
+        low=from_host(inputs.min(axis=0) - steps),
+        high=from_host(inputs.max(axis=0) + steps),
+        mean=from_host(mean_over(inputs, weights)),
+        std=from_host(std_over(inputs, weights)),
+        grid=from_host(operating[:, column or 0]),
+        operating=from_host(operating),
+        whitening=from_host(W / reach),
         fixed=len(fixed),
         schedule=column,
     )

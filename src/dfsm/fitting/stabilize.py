@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 from dfsm.fitting.linear import LinearFit
@@ -163,7 +163,7 @@ def _stable_points(
         fixed[:, :n] += _change(A, rows, metric, known_to, margin, free)
         coefficients[k], offsets[k], variance[k] = equations.complete(held, fixed, affine)
     share = fit.samples / fit.samples.sum()
-    model = replace(fit.model, coefficients=jnp.asarray(coefficients), offsets=jnp.asarray(offsets))
+    model = replace(fit.model, coefficients=from_host(coefficients), offsets=from_host(offsets))
     return replace(fit, model=model, residual_rms=np.sqrt(share @ variance)), moved
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.state_space import StateFeedback, regulator_gain
+from dfsm.core.host import from_host
 from dfsm.core.settings import require
 from dfsm.errors import DfsmError, missing
 from dfsm.models.dfsm import DFSM
@@ -86,7 +86,7 @@ def linear_quadratic(
         np.diag(np.array(list(controls.values())) ** -2.0),
         interval,
     )
-    summing = jnp.asarray(gain[:, n:] @ summed) if m else None
+    summing = from_host(gain[:, n:] @ summed) if m else None
     return StateFeedback(
         gain=gain[:, :n],
         integral_gain=summing,

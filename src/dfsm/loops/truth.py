@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.discon import Discon, write_discon
+from dfsm.core.host import from_host
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.readers import read
 from dfsm.data.trajectory import Channel, Trajectory
@@ -233,19 +234,20 @@ def exact_model(system: ODESystem) -> DFSM:
         *(Channel(f"{c.name}'", c.unit) for c in system.outputs),
     )
     term = _RightSide(columns=tuple(range(n)), channels=values, system=system)
-    chosen = jnp.concatenate([jnp.zeros((m + k, n)), jnp.eye(m + k)], axis=1)
-    ends = jnp.full(n, _ENDLESS)
-    rest = (0 * ends, ends, jnp.zeros(1), jnp.zeros((1, n)))
+    chosen = np.concatenate([np.zeros((m + k, n)), np.eye(m + k)], axis=1)
+    ends = np.full(n, _ENDLESS)
+    low, high, none = map(from_host, (-ends, ends, 0 * ends))
 
     def rows(part: slice, count: int) -> LinearModel:
-        return LinearModel(jnp.zeros(1), chosen[None, part], jnp.zeros((1, count)), None)
+        grid, L, b = map(from_host, (np.zeros(1), chosen[None, part], np.zeros((1, count))))
+        return LinearModel(grid, L, b, None)
 
     return DFSM(
         f=rows(slice(0, m), m),
         e=None,
         g=rows(slice(m, m + k), k) if k else None,
         e_g=None,
-        region=Region(-ends, ends, *rest),
+        region=Region(low, high, none, high, from_host(np.zeros(1)), from_host(np.zeros((1, n)))),
         corrected=(),
         corrected_outputs=(),
         signals=SignalTable(
@@ -257,5 +259,5 @@ def exact_model(system: ODESystem) -> DFSM:
             specs=tuple(StateSpec(name=c.name) for c in system.states),
             derivatives=DerivativeSettings(),
         ),
-        terms=Terms((term,), jnp.zeros(m + k), jnp.ones(m + k)),
+        terms=Terms((term,), from_host(np.zeros(m + k)), from_host(np.ones(m + k))),
     )

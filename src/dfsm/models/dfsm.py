@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.drawing import Shown
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import labels
 from dfsm.errors import DfsmError, printable
@@ -155,18 +156,18 @@ class DFSM(eqx.Module):
         order = self.signals.order
         groups = order.arrays(states, controls, disturbances, parameters)
         if self.g is None:
-            return jnp.zeros((*jnp.broadcast_shapes(*(a.shape[:-1] for a in groups)), 0))
+            return from_host(np.zeros((*np.broadcast_shapes(*(a.shape[:-1] for a in groups)), 0)))
         return _evaluate(self, _output, groups, self.g.schedule, self._harmonics(azimuth, field))
 
     def _harmonics(self, psi: ArrayLike | None, field: ArrayLike | None) -> jax.Array:
         """What ĝ takes beside I, shape ``(..., harmonic)``; zero, its mean, without an azimuth."""
         azimuth = self.signals.azimuth
         if azimuth is None or psi is None:
-            return jnp.zeros(self._count_harmonics())
+            return from_host(np.zeros(self._count_harmonics()))
         if not azimuth.rings:
             return blade_harmonics(psi, azimuth.blades)
         names = self.signals.names("field")
-        field = None if field is None else jnp.asarray(field)
+        field = None if field is None else from_host(field)
         shape = None if field is None else field.shape
         if field is None or not shape or shape[-1] != len(names):
             raise DfsmError(
@@ -210,7 +211,7 @@ class DFSM(eqx.Module):
 
     def split(self, inputs: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Take I apart: states, controls, disturbances, parameters."""
-        return self.signals.order.split(jnp.asarray(inputs))
+        return self.signals.order.split(from_host(inputs))
 
     def prepared(self) -> DFSM:
         """The same model with what does not depend on the inputs computed once, for use in loops.
@@ -256,9 +257,9 @@ class DFSM(eqx.Module):
             raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
         xs, us = self.signals.state_columns, self.signals.order.driving_columns
         J = np.asarray(_jacobian(self, _derivative, inputs))
-        extra = jnp.zeros(self._count_harmonics())
+        extra = np.zeros(self._count_harmonics())
         G = (
-            np.asarray(_jacobian(self, _output, jnp.concatenate([inputs, extra])))
+            np.asarray(_jacobian(self, _output, from_host(np.concatenate([inputs, extra]))))
             if self.g is not None
             else np.empty((0, len(inputs)))
         )

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
-import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host, traced
 from dfsm.errors import DfsmError, near_matches
 
 # Controls and disturbances stand first and together: they are what B acts on.
@@ -96,7 +97,7 @@ class InputOrder:
         """
         arrays = []
         for group, value in zip(_ARGUMENTS, values, strict=True):
-            array, names = jnp.asarray(value, dtype=jnp.float64), getattr(self, group)
+            array, names = _numbers(value), getattr(self, group)
             if array.ndim == 0 or array.shape[-1] != len(names):
                 raise DfsmError(
                     f"{group} have shape {array.shape}, expected the last axis to hold "
@@ -107,20 +108,23 @@ class InputOrder:
 
     def join(self, *arrays: jax.Array) -> jax.Array:
         """I, shape ``(..., input)``, of states, controls, disturbances and parameters."""
-        shape = jnp.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+        shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+        if not traced(*arrays):
+            wide = [np.broadcast_to(a, (*shape, a.shape[-1])) for a in _in_order(arrays)]
+            return from_host(np.concatenate(wide, axis=-1))
         wide = [jnp.broadcast_to(a, (*shape, a.shape[-1])) for a in _in_order(arrays)]
         return jnp.concatenate(wide, axis=-1)
 
     def split(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """States, controls, disturbances and parameters of I, ``(..., input)``."""
         at = _slices(GROUPS, self)
-        x, u, w, p = (inputs[..., at[group]] for group in _ARGUMENTS)
+        x, u, w, p = (_part(inputs, at[group]) for group in _ARGUMENTS)
         return x, u, w, p
 
     def split_exogenous(self, values: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Controls, disturbances and parameters of ``(..., exogenous)``."""
         at = _slices(_EXOGENOUS, self)
-        u, w, p = (values[..., at[group]] for group in _EXOGENOUS)
+        u, w, p = (_part(values, at[group]) for group in _EXOGENOUS)
         return u, w, p
 
     def element(self, column: int | None, *arrays: jax.Array) -> jax.Array:
@@ -139,9 +143,21 @@ class InputOrder:
         first = 0
         for array in _in_order(arrays):
             if column is not None and column < first + array.shape[-1]:
-                return array[..., column - first]
+                return _part(array, column - first)
             first += array.shape[-1]
-        return jnp.zeros(())
+        return jnp.zeros(()) if traced(*arrays) else from_host(0.0)
+
+
+def _numbers(value: ArrayLike) -> jax.Array:
+    """An array of 64-bit numbers."""
+    if isinstance(value, jax.Array) or traced(*jax.tree.leaves(value)):
+        return jnp.asarray(value, dtype=jnp.float64)
+    return from_host(np.asarray(value, dtype=np.float64))
+
+
+def _part(values: jax.Array, at: slice | int) -> jax.Array:
+    """Some of the last axis."""
+    return values[..., at] if traced(values) else from_host(np.asarray(values)[..., at])
 
 
 def _in_order(arrays: Sequence[jax.Array]) -> list[jax.Array]:

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.dfsm import DFSM
@@ -186,7 +187,7 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     v = np.concatenate([inputs.values, np.repeat(inputs.values[-1:], padded + 1 - len(run), 0)])
     ends, held = None, _held(model)
     if held.any():
-        ends = jnp.asarray(np.where(held, v[:-1], v[1:]))
+        ends = from_host(np.where(held, v[:-1], v[1:]))
     path = as_states(evolve(poles(model), h, v, rest(run.time, inputs.values), ends))
     return np.asarray(path)[: len(run)]
 
@@ -276,8 +277,8 @@ def add_latents(
         return replace(
             linear,
             schedule=schedule + count if schedule is not None and schedule >= at else schedule,
-            coefficients=jnp.asarray(L),
-            offsets=jnp.asarray(b),
+            coefficients=from_host(L),
+            offsets=from_host(b),
             known=tuple(sorted(known)),
         )
 
@@ -331,7 +332,7 @@ def _with_range(region: Region, gone: slice, paths: Sequence[Array]) -> Region:
 
     def put(values: jax.Array, new: Array) -> jax.Array:
         kept = np.delete(np.asarray(values), gone, axis=-1)
-        return jnp.asarray(np.insert(kept, place, new, axis=-1))
+        return from_host(np.insert(kept, place, new, axis=-1))
 
     return replace(
         region,

@@ -7,9 +7,10 @@ from dataclasses import field
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
-import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host, traced
 from dfsm.numerics.hats import hats
 
 
@@ -55,14 +56,17 @@ class Region(eqx.Module):
     std: jax.Array
     grid: jax.Array
     operating: jax.Array
-    whitening: jax.Array = field(default_factory=lambda: jnp.zeros((0, 0, 0)))
+    whitening: jax.Array = field(default_factory=lambda: from_host(np.zeros((0, 0, 0))))
     fixed: int = eqx.field(static=True, default=0)
     schedule: int | None = eqx.field(static=True, default=None)
 
     @property
     def scale(self) -> jax.Array:
         """What standardised inputs are divided by: `std`, and 1 for what does not vary."""
-        return jnp.where(self.std > 0, self.std, 1.0)
+        if traced(self.std):
+            return jnp.where(self.std > 0, self.std, 1.0)
+        std = np.asarray(self.std)
+        return from_host(np.where(std > 0, std, 1.0))
 
     def outside(self, inputs: ArrayLike) -> jax.Array:
         """Tell which samples of ``(..., input)`` are outside the training data.
@@ -70,7 +74,7 @@ class Region(eqx.Module):
         Either an input is outside its range, or all together are farther from what occurred
         together than samples of a new run usually are.
         """
-        return self._outside(jnp.asarray(inputs))
+        return self._outside(from_host(inputs))
 
     @eqx.filter_jit
     def _outside(self, inputs: jax.Array) -> jax.Array:
@@ -84,9 +88,13 @@ class Region(eqx.Module):
 
     def beyond(self, inputs: ArrayLike) -> jax.Array:
         """Tell which of ``(..., input)`` are outside their own training range."""
-        slack = 1e-9 * (self.high - self.low)
-        inputs = jnp.asarray(inputs)
-        return (inputs < self.low - slack) | (inputs > self.high + slack)
+        low, high = self.low, self.high
+        if isinstance(inputs, np.ndarray | jax.Array) and not traced(inputs, low, high):
+            low, high, inputs = map(np.asarray, (low, high, inputs))
+        else:
+            inputs = jnp.asarray(inputs)
+        slack = 1e-9 * (high - low)
+        return from_host((inputs < low - slack) | (inputs > high + slack))
 
     def distance(self, inputs: ArrayLike) -> jax.Array:
         """Squared distance of ``(..., input)`` from the training data: 1 is as far as is usual.

@@ -9,10 +9,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, ComplexArray
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import at_rest
@@ -200,7 +200,7 @@ def destabilised(model: DFSM) -> str | None:
 
 def state_matrices(model: DFSM, points: Array) -> Array:
     """A at inputs ``(point, input)`` with latent states at rest, ``(point, state, state)``."""
-    return np.asarray(_state_matrices(model, jnp.asarray(points)))
+    return np.asarray(_state_matrices(model, from_host(points)))
 
 
 @eqx.filter_jit

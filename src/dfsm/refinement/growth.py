@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, ComplexArray
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import at_rest
@@ -50,7 +51,7 @@ class StabilityKept:
         """Sum of squares, infinite where the model is unstable."""
         if self._idle:
             return 0.0
-        model, worst = self._parameters.at(jnp.asarray(weights)), -np.inf
+        model, worst = self._parameters.at(from_host(weights)), -np.inf
         growth = self._eigen(model)[0]
         if model.e is None and model.terms is None:
             worst = fastest_growth(model.linear_state_matrices())
@@ -62,12 +63,10 @@ class StabilityKept:
         """JᵀJ and Jᵀr."""
         if self._idle:
             return np.zeros((len(weights), len(weights))), np.zeros(len(weights))
-        growth, left, right = self._eigen(self._parameters.at(jnp.asarray(weights)))
+        growth, left, right = self._eigen(self._parameters.at(from_host(weights)))
         r = self._excess(growth)
-        vectors = jnp.asarray(left), jnp.asarray(right)
-        slopes = _slopes(
-            self._parameters, jnp.asarray(weights), jnp.asarray(self._points), *vectors
-        )
+        vectors = from_host(left), from_host(right)
+        slopes = _slopes(self._parameters, from_host(weights), from_host(self._points), *vectors)
         J = np.where(r > 0, self._weight, 0.0)[:, None] * np.asarray(slopes)
         return J.T @ J, J.T @ r
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.models.corrective import Corrective
@@ -69,7 +70,7 @@ class Parametrization(eqx.Module):
         free = tuple(tuple((i, c) not in model.f.known for c in constant) for i in rows)
         typical = np.maximum(spread[list(rows)], np.finfo(float).tiny)
         driven = tuple(np.flatnonzero(np.asarray(poles(model).drive).any(axis=0)).tolist())
-        return cls(model, jnp.asarray(typical), rows, scheduled, constant, free, driven)
+        return cls(model, from_host(typical), rows, scheduled, constant, free, driven)
 
     @property
     def size(self) -> int:

@@ -21,10 +21,10 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from dfsm.core.host import from_host
 from dfsm.core.renamed import renamed
 from dfsm.data.dataset import Dataset
 from dfsm.data.hold_out import checked, divisions
@@ -148,7 +148,7 @@ def refine(
             at, entries, why = train_on_all(problem, at, round(count), course.late)
             history += [{"stage": stage, **entry} for entry in entries]
             ended.append(why)
-    refined = parameters.at(jnp.asarray(at))
+    refined = parameters.at(from_host(at))
     if refined.signals.latents:
         seen = first.train if len(trials) == 1 else records
         paths = [record.latent_states(refined) for group in seen for record in group]

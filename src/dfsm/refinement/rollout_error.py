@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
 from dfsm.models.completion import completed
@@ -77,29 +78,29 @@ class Record:
         n, v = len(self.rest), self.inputs
         if self.held is None:
             return v[::2, :n], None
-        begin, _, end = (np.asarray(part)[:, :n] for part in stages(jnp.asarray(v), self.held))
+        begin, _, end = (np.asarray(part)[:, :n] for part in stages(from_host(v), self.held))
         return np.concatenate([begin, v[-1:, :n]]), end
 
     def follow(self, filters: Poles) -> Array:
         """Latent pairs from the start of the record on, complex, ``(before + step + 1, pair)``."""
-        h = jnp.full(len(self.inputs) // 2, self.step)
+        h = np.full(len(self.inputs) // 2, self.step)
         v, ends = self.driving()
-        ends = None if ends is None else jnp.asarray(ends)
-        return np.asarray(evolve(filters, h, jnp.asarray(v), jnp.asarray(self.rest), ends))
+        ends = None if ends is None else from_host(ends)
+        return np.asarray(evolve(filters, h, from_host(v), from_host(self.rest), ends))
 
     def latent_states(self, model: DFSM) -> Array:
         """A model's latent states from the first state on, ``(step + 1, latent)``."""
         pairs = self.follow(poles(model))[self.before :]
-        return np.asarray(as_states(jnp.asarray(pairs)))
+        return np.asarray(as_states(from_host(pairs)))
 
     def inputs_at(self, model: DFSM) -> Array:
         """I along the record, ``(step + 1, input)``."""
         states, exogenous = self._along(model)
-        return np.asarray(model.join(jnp.asarray(states), *exogenous))
+        return np.asarray(model.join(from_host(states), *exogenous))
 
     def _along(self, model: DFSM) -> tuple[Array, Any]:
         states = np.concatenate([self.states, self.latent_states(model)], axis=1)
-        inputs = jnp.asarray(self.inputs[2 * self.before :: 2])
+        inputs = from_host(self.inputs[2 * self.before :: 2])
         return states, model.signals.order.split_exogenous(inputs)
 
     def left_over(self, model: DFSM) -> Array:
@@ -278,7 +279,7 @@ class RolloutError:
         self._count = sum(w.states[:, 1:].size for group in self._groups for w in group)
 
     def _over_groups(self, function: Callable[..., Any], weights: Array) -> list[Any]:
-        w = jnp.asarray(weights)
+        w = from_host(weights)
 
         def one(group: tuple[_Windows, ...], scale: Array) -> Any:
             factors = self._counts.whitening(len(group))

@@ -13,6 +13,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.models.corrective import Perceptron
@@ -83,7 +84,7 @@ def start_latents(
     both = np.stack([c.real, -c.imag], axis=2).reshape(len(rows), count)
     coupling[rows] = both * spread[rows, None]
     gains = _through_terms(model, records, coupling)
-    along = [np.asarray(as_states(jnp.asarray(z))) for z in pairs_along]
+    along = [np.asarray(as_states(from_host(z))) for z in pairs_along]
     return add_latents(model, dynamics, coupling, along, gains)
 
 
@@ -114,8 +115,8 @@ def start_network(model: DFSM, hidden: int, spread: Array, seed: int) -> DFSM:
     network = Perceptron(
         shift=region.mean,
         scale=region.scale,
-        weights=(jnp.asarray(directions), jnp.zeros((len(rows), hidden))),
-        biases=(jnp.asarray(rng.uniform(-1, 1, hidden)), jnp.zeros(len(rows))),
+        weights=(from_host(directions), from_host(np.zeros((len(rows), hidden)))),
+        biases=(from_host(rng.uniform(-1, 1, hidden)), from_host(np.zeros(len(rows)))),
     )
     unseen = model.f.hidden_among(inputs, model.signals.latent_columns)
     return replace(model, e=network.ignoring(unseen), corrected=rows)

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
@@ -375,7 +376,7 @@ def result_of(
     result = _cut(case, (values, outside), channels, (status, reason, time[min(end, steps - 1)]))
     if not (result.outside > 0 and status is LoopStatus.COMPLETED):
         return result
-    exogenous = jnp.asarray(np.asarray(case.drive.inputs)[::2][:steps])
+    exogenous = from_host(np.asarray(case.drive.inputs)[::2][:steps])
     _, w, p = s.order.split_exogenous(exogenous)
     inputs = case.sampled(np.asarray(model.join(states, controls, w, p)))
     kept = slice(len(inputs) - len(result.trajectory), None)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
@@ -116,7 +117,7 @@ class _Past:
 
     def rollout(self, model: DFSM, start: Array) -> Array:
         """States at the samples, ``(time, state)``."""
-        return np.asarray(_follow(model, jnp.asarray(start), self.h, self.drive))[:: self.every]
+        return np.asarray(_follow(model, from_host(start), self.h, self.drive))[:: self.every]
 
     def solved(self, model: DFSM) -> Array:
         """The state at the beginning that meets what was measured best."""
@@ -145,12 +146,12 @@ class _StartError:
         return self._mean + self._scale * weights
 
     def cost(self, weights: Array) -> float:
-        r = self._residuals(jnp.asarray(weights))
+        r = self._residuals(from_host(weights))
         total = float(np.sum(np.square(r)))
         return total if np.isfinite(total) else np.inf
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
-        w = jnp.asarray(weights)
+        w = from_host(weights)
         r, J = np.asarray(self._residuals(w)), np.asarray(self._slopes(w))
         return J.T @ J, J.T @ r
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.between import Between, polynomials
 from dfsm.data.trajectory import Trajectory
@@ -332,10 +333,10 @@ def adapt(model: DFSM, case: Case[Pieces], method: str, tolerances: tuple[float,
     driven = (drive.time, drive.values, drive.starts, drive.coefficients)
     *path, solved = _adapt(
         model,
-        tuple(map(jnp.asarray, driven)),
-        tuple(map(jnp.asarray, bends)),
-        tuple(map(jnp.asarray, tolerances)),
-        start=tuple(map(jnp.asarray, start)),
+        tuple(map(from_host, driven)),
+        tuple(map(from_host, bends)),
+        tuple(map(from_host, tolerances)),
+        start=tuple(map(from_host, start)),
         method=method,
     )
     return Rollout(*map(np.asarray, path), solved=bool(solved))

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, printable
 from dfsm.models.dfsm import DFSM
@@ -295,7 +296,7 @@ class HostLoop:
         states[0], psi = drive.x0, drive.psi0
         seen = np.asarray(self._seen(states[0], v[0], (psi, field[0])))
         with _failing("start"):
-            state = controller.start(seen, np.asarray(wires.commands_of(jnp.asarray(v[0]))))
+            state = controller.start(seen, np.asarray(wires.commands_of(v[0])))
         try:
             for k, (time, h) in enumerate(zip(drive.time, drive.h, strict=True)):
                 row = k * per_call
@@ -317,12 +318,10 @@ class HostLoop:
             close = getattr(state, "close", None)
             if close is not None:
                 close()
-        inputs = wires.with_commands(
-            jnp.asarray(v[::2]), wires.in_model_units(jnp.asarray(commands))
-        )
-        h = jnp.repeat(jnp.asarray(drive.h), per_call)
+        inputs = wires.with_commands(from_host(v[::2]), wires.in_model_units(from_host(commands)))
+        h = from_host(np.repeat(drive.h, per_call))
         outputs, outside, _ = self._observed(
-            self.model, h, jnp.asarray(states), (inputs, drive.field), jnp.asarray(drive.psi0)
+            self.model, h, from_host(states), (inputs, drive.field), from_host(drive.psi0)
         )
         count = len(self.model.signals.controls)
         return Path(states, inputs[:, :count], outputs, outside, read)  # pyright: ignore[reportArgumentType]

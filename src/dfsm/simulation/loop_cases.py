@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from dfsm.core.host import from_host
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.data.between import Between
@@ -198,4 +198,4 @@ def padded(case: LoopCase, calls: int) -> Drive:
     time = np.concatenate([d.time, d.time[-1] + interval * np.arange(1, more + 1)])
     h = np.concatenate([d.h, np.zeros(more)])
     inputs, field = held(np.asarray(d.inputs), 2 * steps), held(np.asarray(d.field), steps)
-    return Drive(*map(jnp.asarray, (d.x0, d.psi0, time, h, inputs, field)))
+    return Drive(*map(from_host, (d.x0, d.psi0, time, h, inputs, field)))

@@ -7,9 +7,9 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmWarning, printable
@@ -138,7 +138,7 @@ def judge(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) ->
     left, weights = rollout.outside[:end], _weights(driven.time[:end])
     seen: tuple[Departure, ...] = ()
     if left.any():
-        exogenous = s.order.split_exogenous(jnp.asarray(driven.values[:end]))
+        exogenous = s.order.split_exogenous(from_host(driven.values[:end]))
         inputs = np.asarray(model.join(x[:end], *exogenous))
         seen = departures(model.region, s.inputs, time[:end], inputs, left, weights)
     return Simulation(

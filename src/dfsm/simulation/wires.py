@@ -78,7 +78,7 @@ class Wires:
 
     def commands_of(self, exogenous: jax.Array) -> jax.Array:
         """What the controller would have set, in its units, ``(command,)``."""
-        return exogenous[jnp.array(self.commanded)] / jnp.array(self.command_factors)
+        return exogenous[np.array(self.commanded, dtype=int)] / np.array(self.command_factors)
 
     def with_commands(self, exogenous: jax.Array, commands: jax.Array) -> jax.Array:
         """Exogenous inputs ``(..., exogenous)`` with the controls set, in the model's units.
@@ -100,7 +100,7 @@ class Wires:
 
     def in_model_units(self, commands: jax.Array) -> jax.Array:
         """Commands ``(..., command)`` of the controller in the model's units."""
-        return commands * jnp.array(self.command_factors)
+        return commands * np.array(self.command_factors)
 
 
 def connect(

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.simulators.evaluate import Function, as_jax
 from dfsm.simulators.waveforms import Signal
@@ -94,7 +95,7 @@ def solve_jax(
         # An accelerator would spend its time on starting the thousands of tiny operations.
         with jax.default_device(jax.devices("cpu")[0]):
             # Tolerances as arrays: a number would be compiled in, and another compile again.
-            limits = jnp.asarray(tolerances[0]), jnp.asarray(tolerances[1])
+            limits = from_host(tolerances[0]), from_host(tolerances[1])
             drive = (start.controls, start.disturbances, start.parameters)
             states = _integrate(f, time, start.initial, drive, start.corners, limits)
             return np.asarray(states), None

@@ -18,6 +18,7 @@ import numpy as np
 from dfsm.control.nlp.structure import inner_code
 from dfsm.control.nlp.terms import Functions, common_of
 from dfsm.control.problem import OptimalControlProblem
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 
@@ -52,10 +53,10 @@ def _searched(problem: OptimalControlProblem, functions: Functions) -> list[Arra
     for part in functions.node.parts or ():
 
         def local(tau: Any, z: Any, part: Callable[..., Any] = part) -> Any:
-            data = {"tau": tau, "scenario": 0, "w": jnp.ones(len(names))}
+            data = {"tau": tau, "scenario": 0, "w": from_host(np.ones(len(names)))}
             return part(z, data, common)
 
-        one = jnp.ones(functions.nx + functions.nu + extra)
+        one = from_host(np.ones(functions.nx + functions.nu + extra))
         code = jax.make_jaxpr(local)(0.5, one)
         if not _searches(code.jaxpr):
             continue
@@ -108,7 +109,7 @@ def _arguments(closed: Any, tau: Array, z: Any) -> list[tuple[Array, Array]]:
         tables[:] = [np.asarray(table) for table, _ in kept]
         return [jnp.asarray(value, dtype=float) for _, value in kept]
 
-    followed = jax.vmap(values)(jnp.asarray(tau))
+    followed = jax.vmap(values)(from_host(tau))
     return [(t, np.asarray(v)) for t, v in zip(tables, followed, strict=True)]
 
 

@@ -20,6 +20,7 @@ from dfsm.control.levels import is_number
 from dfsm.control.names import End, Signals
 from dfsm.control.nlp.structure import dependent, varies
 from dfsm.control.problem import OptimalControlProblem
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 
@@ -273,8 +274,8 @@ def scalar(function: Callable[..., Any], what: str, *arguments: Any) -> jax.Arra
 def _check_model(functions: Functions, problem: OptimalControlProblem) -> None:
     """Refuse a model whose functions return other numbers of values than it has channels."""
     plant = functions.plant
-    arguments = [jnp.ones(len(plant.names(g))) for g in ("states", "controls", "disturbances")]
-    arguments.append(jnp.ones(len(plant.names("parameters"))))
+    groups = ("states", "controls", "disturbances", "parameters")
+    arguments = [from_host(np.ones(len(plant.names(g)))) for g in groups]
     for function, group, what in (
         (plant.derivative, "states", "the model's f"),
         (plant.output, "outputs", "the model's g"),
@@ -298,10 +299,11 @@ def _sizes(
     """
     common = common_of(problem)
     extra = len(problem.free_parameters) + (problem.free_time is not None)
-    data = {"tau": jnp.array(0.5), "scenario": 0}
-    data["w"] = jnp.ones(len(problem.plant.names("disturbances")))
+    data = {"tau": from_host(0.5), "scenario": 0}
+    data["w"] = from_host(np.ones(len(problem.plant.names("disturbances"))))
     # All that can be chosen at a node, and at the ends.
-    z, ends = jnp.ones(functions.nx + functions.nu + extra), jnp.ones(2 * functions.nx + extra)
+    z = from_host(np.ones(functions.nx + functions.nu + extra))
+    ends = from_host(np.ones(2 * functions.nx + extra))
 
     def node(function: Callable[..., Any], what: str) -> Callable[[jax.Array], jax.Array]:
         return lambda z: vector(function, what, functions.signals(z, data, common)[0])
@@ -330,10 +332,12 @@ def _sizes(
         jax.eval_shape(lambda z: functions.final_cost(z, common), ends)
 
     def by_controls(u: jax.Array) -> jax.Array:
-        x, q = jnp.ones(functions.nx), jnp.ones(extra)
+        x, q = from_host(np.ones(functions.nx)), from_host(np.ones(extra))
         return functions.path(functions.signals(jnp.concatenate([x, u, q]), data, common)[0])
 
-    (jumps,) = dependent(by_controls, jnp.ones(functions.nu)) if path else (np.zeros(0, bool),)
+    if not path:
+        return path, boundary, np.zeros(0, bool)
+    (jumps,) = dependent(by_controls, from_host(np.ones(functions.nu)))
     return path, boundary, jumps
 
 

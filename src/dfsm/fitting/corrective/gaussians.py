@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.fitting.corrective.training import TrainingSet
 from dfsm.models.corrective import GaussianUnits
@@ -50,9 +50,9 @@ def gaussian_units(
 ) -> GaussianUnits:
     """Build the JAX module from centres and weights that refer to standardised samples."""
     return GaussianUnits(
-        shift=jnp.asarray(data.shift),
-        scale=jnp.asarray(data.scale * width),
-        centres=jnp.asarray((centres / width).T),
-        weights=jnp.asarray((weights * data.target_scale).T),
-        bias=jnp.asarray(bias * data.target_scale),
+        shift=from_host(data.shift),
+        scale=from_host(data.scale * width),
+        centres=from_host((centres / width).T),
+        weights=from_host((weights * data.target_scale).T),
+        bias=from_host(bias * data.target_scale),
     )

@@ -15,17 +15,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 
 _BLOCK = 1000
 
 Sizes = tuple[int, ...]
+# Of the host or of JAX.
+Numbers = TypeVar("Numbers", bound=Any)
 
 
 @partial(jax.jit, static_argnames="sizes")
@@ -47,7 +50,7 @@ def evaluate(weights: jax.Array, z: jax.Array, sizes: Sizes) -> jax.Array:
     return _extended(z) @ last.T
 
 
-def layers(weights: jax.Array, sizes: Sizes) -> list[jax.Array]:
+def layers(weights: Numbers, sizes: Sizes) -> list[Numbers]:
     """Matrices ``[W b]`` of the layers, shapes ``(out, in + 1)``."""
     matrices, at = [], 0
     for i, o in pairwise(sizes):
@@ -81,18 +84,18 @@ class NetworkError:
         rows = np.arange(blocks * _BLOCK)
         counts = (rows < len(z)).astype(float).reshape(blocks, _BLOCK)
         rows = np.minimum(rows, len(z) - 1)
-        zs, ys = (a[rows].reshape(blocks, _BLOCK, -1) for a in (z, targets))
-        return cls(sizes, jnp.asarray(zs), jnp.asarray(ys), jnp.asarray(counts))
+        zs, ys = (np.asarray(a)[rows].reshape(blocks, _BLOCK, -1) for a in (z, targets))
+        return cls(sizes, from_host(zs), from_host(ys), from_host(counts))
 
     def cost(self, weights: Array) -> float:
         """Sum of the squared residuals r."""
         samples = self.z, self.targets, self.counts
-        return float(_cost(jnp.asarray(weights), samples, self.sizes))
+        return float(_cost(from_host(weights), samples, self.sizes))
 
     def normal_equations(self, weights: Array) -> tuple[Array, Array]:
         """JᵀJ and Jᵀr, shapes ``(weight, weight)`` and ``(weight,)``, with J = dr/dw."""
         samples = self.z, self.targets, self.counts
-        JtJ, Jtr = _normal_equations(jnp.asarray(weights), samples, self.sizes)
+        JtJ, Jtr = _normal_equations(from_host(weights), samples, self.sizes)
         return np.asarray(JtJ), np.asarray(Jtr)
 
 

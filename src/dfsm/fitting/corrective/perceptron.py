@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from itertools import islice, pairwise
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.progress import track
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array, IntArray
@@ -69,7 +69,7 @@ def _train(data: TrainingSet, settings: MLP, seed: int) -> CorrectiveFit:
     sizes = (data.z.shape[1], *settings.hidden, data.targets.shape[1])
 
     def squares(w: Array) -> Array:
-        predicted = evaluate(jnp.asarray(w), jnp.asarray(held.z), sizes)
+        predicted = evaluate(from_host(w), from_host(held.z), sizes)
         return (np.asarray(predicted) - held.targets) ** 2
 
     def typical(step: Step) -> float:
@@ -86,13 +86,13 @@ def _train(data: TrainingSet, settings: MLP, seed: int) -> CorrectiveFit:
     final, everything = best, data.spread(settings.samples, seed)
     for _, step in _steps(sizes, best, everything, settings, round(_POLISH * taken)):
         final = step
-    *hidden, last_layer = layers(jnp.asarray(final.weights), sizes)
-    matrices = (*hidden, last_layer * jnp.asarray(data.target_scale)[:, None])
+    *hidden, last_layer = layers(np.asarray(final.weights), sizes)
+    matrices = (*hidden, last_layer * np.asarray(data.target_scale)[:, None])
     function = Perceptron(
-        shift=jnp.asarray(data.shift),
-        scale=jnp.asarray(data.scale),
-        weights=tuple(M[:, :-1] for M in matrices),
-        biases=tuple(M[:, -1] for M in matrices),
+        shift=from_host(data.shift),
+        scale=from_host(data.scale),
+        weights=tuple(from_host(M[:, :-1]) for M in matrices),
+        biases=tuple(from_host(M[:, -1]) for M in matrices),
     )
     return CorrectiveFit(
         function=function,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
 from dfsm.data.trajectory import Channel, Trajectory
@@ -219,7 +219,8 @@ def _equation(found: Found, places: IntArray) -> tuple[LinearModel, Corrective |
     coefficients = np.zeros_like(slopes)
     coefficients[:, places] = slopes
     offsets = rate * L[:, -1] - slopes @ mean
-    f = LinearModel(jnp.zeros(1), jnp.asarray(coefficients)[None], jnp.asarray(offsets)[None], None)
+    grid, *linear = map(from_host, (np.zeros(1), coefficients[None], offsets[None]))
+    f = LinearModel(grid, linear[0], linear[1], None)
     shift, spread = np.zeros(len(places)), np.ones(len(places))
     shift[places], spread[places] = mean, scale
     return f, _corrective(form, others, (places, rate), (shift, spread))
@@ -231,11 +232,11 @@ def _corrective(
     to: tuple[IntArray, Array],
     standard: tuple[Array, Array],
 ) -> Corrective | None:
-    (places, rate), (shift, scale) = to, map(jnp.asarray, standard)
+    (places, rate), (shift, scale) = to, map(from_host, standard)
     if form.kind == "polynomial":
         columns = [*places.tolist(), len(places)]
         factors = tuple(tuple(columns[c] for c in f) for f in form.factors)
-        weights = jnp.asarray(rate[:, None] * parts[0])
+        weights = from_host(rate[:, None] * parts[0])
         return Polynomial(shift, scale, weights, factors, form.reach)
     if form.kind == "tanh":
         directions = np.zeros((form.units, len(places)))
@@ -243,8 +244,8 @@ def _corrective(
         return Perceptron(
             shift,
             scale,
-            weights=(jnp.asarray(directions), jnp.asarray(rate[:, None] * parts[1])),
-            biases=(jnp.asarray(parts[0][:, -1]), jnp.zeros(form.states)),
+            weights=(from_host(directions), from_host(rate[:, None] * parts[1])),
+            biases=(from_host(parts[0][:, -1]), from_host(np.zeros(form.states))),
         )
     return None
 

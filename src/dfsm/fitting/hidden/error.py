@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.fitting.hidden.form import Form
 from dfsm.fitting.hidden.windows import Windows
@@ -113,7 +114,7 @@ class HiddenError:
         starts = np.pad(own, ((0, 0), (0, self._computed.states - self.form.states)))
         parameters = np.zeros(self._computed.size)
         parameters[self._places] = weights[:p]
-        theta = jnp.asarray(parameters)
+        theta = from_host(parameters)
 
         def one(rows: slice) -> Any:
             # The last batch is filled up with its last window.

@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Protocol, Self
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 
 
 class Evaluated(Protocol):
@@ -71,8 +71,9 @@ class Corrective(eqx.Module):
 
     def ignoring(self, columns: Sequence[int]) -> Self:
         """Hold some inputs at the middle of their range, whatever they are."""
-        scale = self.scale.at[np.array(columns, dtype=int)].set(jnp.inf)
-        return replace(self, scale=scale)
+        scale = np.array(self.scale)
+        scale[np.array(columns, dtype=int)] = np.inf
+        return replace(self, scale=from_host(scale))
 
     @abstractmethod
     def with_more_inputs(self, at: int, count: int) -> Self:

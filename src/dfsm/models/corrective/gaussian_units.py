@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.models.corrective.form import Corrective
 
 
@@ -51,25 +52,25 @@ class GaussianUnits(Corrective):
         rows = np.array([*kept, count, count + 1])
         return replace(
             ready,
-            shift=ready.shift[kept],
-            scale=ready.scale[kept],
-            matrix=ready.matrix[rows],
+            shift=from_host(np.asarray(ready.shift)[kept]),
+            scale=from_host(np.asarray(ready.scale)[kept]),
+            matrix=from_host(np.asarray(ready.matrix)[rows]),
             spans=spans or ((0, 0),),
         )
 
     def select(self, rows: Sequence[int]) -> GaussianUnits:
         """Keep some of the targets."""
-        keep = np.array(rows)
-        return replace(self, weights=self.weights[keep], bias=self.bias[keep])
+        weights, bias = (from_host(np.asarray(a)[np.array(rows)]) for a in self.parameters)
+        return replace(self, weights=weights, bias=bias)
 
     def with_more_inputs(self, at: int, count: int) -> GaussianUnits:
         """The same function of more inputs: its units are infinitely wide in their directions."""
         place = np.full(count, at)
         return replace(
             self,
-            shift=jnp.insert(self.shift, place, 0.0),
-            scale=jnp.insert(self.scale, place, jnp.inf),
-            centres=jnp.insert(self.centres, place, 0.0, axis=0),
+            shift=from_host(np.insert(self.shift, place, 0.0)),
+            scale=from_host(np.insert(self.scale, place, np.inf)),
+            centres=from_host(np.insert(self.centres, place, 0.0, axis=0)),
         )
 
     @property

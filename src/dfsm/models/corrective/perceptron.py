@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.models.corrective.form import Corrective
 
 
@@ -37,11 +38,10 @@ class Perceptron(Corrective):
 
     def select(self, rows: Sequence[int]) -> Perceptron:
         """Keep some of the targets."""
-        keep = np.array(rows)
+        last = (from_host(np.asarray(a[-1])[np.array(rows)]) for a in (self.weights, self.biases))
+        weights, biases = last
         return replace(
-            self,
-            weights=(*self.weights[:-1], self.weights[-1][keep]),
-            biases=(*self.biases[:-1], self.biases[-1][keep]),
+            self, weights=(*self.weights[:-1], weights), biases=(*self.biases[:-1], biases)
         )
 
     def with_more_inputs(self, at: int, count: int) -> Perceptron:
@@ -50,9 +50,9 @@ class Perceptron(Corrective):
         first, *others = self.weights
         return replace(
             self,
-            shift=jnp.insert(self.shift, place, 0.0),
-            scale=jnp.insert(self.scale, place, 1.0),
-            weights=(jnp.insert(first, place, 0.0, axis=1), *others),
+            shift=from_host(np.insert(self.shift, place, 0.0)),
+            scale=from_host(np.insert(self.scale, place, 1.0)),
+            weights=(from_host(np.insert(first, place, 0.0, axis=1)), *others),
         )
 
     @property

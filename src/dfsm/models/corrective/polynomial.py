@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.models.corrective.form import Corrective
 
 # Beyond as many standard deviations from its middle, an input counts as if it were there, unless a
@@ -65,7 +66,7 @@ class Polynomial(Corrective):
 
     def select(self, rows: Sequence[int]) -> Polynomial:
         """Keep some of the targets."""
-        return replace(self, weights=self.weights[np.array(rows)])
+        return replace(self, weights=from_host(np.asarray(self.weights)[np.array(rows)]))
 
     def with_more_inputs(self, at: int, count: int) -> Polynomial:
         """The same function of more inputs, of which no monomial is made."""
@@ -73,8 +74,8 @@ class Polynomial(Corrective):
         moved = tuple(tuple(c + count if c >= at else c for c in f) for f in self.factors)
         return replace(
             self,
-            shift=jnp.insert(self.shift, place, 0.0),
-            scale=jnp.insert(self.scale, place, 1.0),
+            shift=from_host(np.insert(self.shift, place, 0.0)),
+            scale=from_host(np.insert(self.scale, place, 1.0)),
             factors=moved,
         )
 

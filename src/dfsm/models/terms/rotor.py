@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.core.units import factor
@@ -198,12 +198,12 @@ class Rotor:
         return RotorTerm(
             columns=at,
             channels=(Channel(f"{self.name}.thrust", "kN"), Channel(f"{self.name}.torque", "kN-m")),
-            weights=jnp.asarray(weights),
-            gains=jnp.zeros(len(self.corrections)),
-            scale=jnp.asarray(self._scale(spreads or {})),
-            late=jnp.zeros((1, 1)),
-            grid_of_late=jnp.zeros(1),
-            trim=jnp.zeros((2, 6)),
+            weights=from_host(weights),
+            gains=from_host(np.zeros(len(self.corrections))),
+            scale=from_host(self._scale(spreads or {})),
+            late=from_host(np.zeros((1, 1))),
+            grid_of_late=from_host(np.zeros(1)),
+            trim=from_host(np.zeros((2, 6))),
             grid=grid,
             about=about,
         )

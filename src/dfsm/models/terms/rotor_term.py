@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
 from dfsm.models.terms.form import Schedule, Term
@@ -200,8 +201,8 @@ class RotorTerm(Term):
         return replace(
             self,
             columns=columns,
-            late=jnp.asarray(late),
-            grid_of_late=jnp.asarray(schedule.grid),
+            late=from_host(late),
+            grid_of_late=from_host(schedule.grid),
             about=replace(self.about, inputs=(*self.about.inputs, *names)),
         )
 
@@ -306,9 +307,9 @@ class RotorTerm(Term):
             gains=arrays["gains"],
             scale=arrays["scale"],
             # Models of 0.1 and before have none.
-            late=arrays.get("late", jnp.zeros((1, 1))),
-            grid_of_late=arrays.get("grid_of_late", jnp.zeros(1)),
-            trim=arrays.get("trim", jnp.zeros((2, 6))),
+            late=arrays.get("late", from_host(np.zeros((1, 1)))),
+            grid_of_late=arrays.get("grid_of_late", from_host(np.zeros(1))),
+            trim=arrays.get("trim", from_host(np.zeros((2, 6)))),
             grid=Grid(**structure["grid"]),
             about=RotorConstants(**about),
         )

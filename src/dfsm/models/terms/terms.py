@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
@@ -59,11 +60,11 @@ class Terms(eqx.Module):
 
     def along(self, inputs: Array) -> Array:
         """Values at many input vectors, shape ``(sample, input)`` to ``(sample, value)``."""
-        return np.asarray(_along(self, jnp.asarray(inputs)))
+        return np.asarray(_along(self, from_host(inputs)))
 
     def slopes(self, inputs: Array) -> Array:
         """∂φ/∂I at many input vectors, ``(sample, input)`` to ``(sample, value, input)``."""
-        return np.asarray(_slopes(self, jnp.asarray(inputs)))
+        return np.asarray(_slopes(self, from_host(inputs)))
 
     def with_more_inputs(self, at: int, count: int) -> Terms:
         """The same terms where I has `count` more inputs from column `at` on."""
@@ -131,7 +132,7 @@ def terms_of(
     columns = {c.name: i for i, c in enumerate(channels)}
     spreads = dict(zip(by_name, np.std(inputs, axis=0).tolist(), strict=True))
     parts = tuple(s.term(by_name, columns, spreads) for s in settings)
-    terms = Terms(parts, jnp.zeros(0), jnp.ones(0))
+    terms = Terms(parts, from_host(np.zeros(0)), from_host(np.ones(0)))
     _check_names(terms, columns)
     values = terms.along(inputs)
     for channel, column in zip(terms.channels, values.T, strict=True):
@@ -141,7 +142,7 @@ def terms_of(
                 "samples: change its function so that it is defined there"
             )
     mean, std = values.mean(axis=0), values.std(axis=0)
-    return replace(terms, mean=jnp.asarray(mean), std=jnp.asarray(std))
+    return replace(terms, mean=from_host(mean), std=from_host(std))
 
 
 def _check_names(terms: Terms, columns: Mapping[str, int]) -> None:
