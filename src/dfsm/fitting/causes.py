@@ -13,9 +13,12 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
+from dfsm.numerics.folds import unfolded
 
 # Samples of the past, samples looked at, and channels beyond which it is not tried.
 _PAST, _MOST_SAMPLES, _MOST_CHANNELS = 10, 20_000, 12
+# Samples looked at where signs are to be found first.
+_SIGNED = 2000
 # F statistic from which the past of others counts, and the share of what it tells of the channel
 # that it tells most of: the past of a response tells a little of a smooth input, too.
 _COUNTS, _SHARE = 4.0, 0.25
@@ -31,9 +34,29 @@ def driven_by_past(run: Trajectory, names: Sequence[str]) -> list[str]:
     names
         Its channels that may be either.
     """
+    if not 2 <= len(names) <= _MOST_CHANNELS:
+        return []
     table = np.nan_to_num(run.select(names).values[:_MOST_SAMPLES])
+    return _driven(table, names) or _driven(_with_signs(table[:_SIGNED]), names)
+
+
+def _with_signs(table: Array) -> Array:
+    """The same where channels that an instrument folded have their signs again.
+
+    What drives x as much one way as the other tells nothing of |x|.
+    """
+    table = table.copy()
+    for i in range(table.shape[1]):
+        others = np.delete(table, i, axis=1)
+        found = unfolded([(others, table[:, i])])
+        if found is not None and found.clear:
+            table[:, i] = found.paths[0]
+    return table
+
+
+def _driven(table: Array, names: Sequence[str]) -> list[str]:
     past = min(_PAST, len(table) // (10 * max(1, len(names))))
-    if not 2 <= len(names) <= _MOST_CHANNELS or past < 2:
+    if past < 2:
         return []
     table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), np.finfo(float).tiny)
     lags = np.stack([table[past - k - 1 : len(table) - k - 1] for k in range(past)], axis=1)

@@ -90,7 +90,8 @@ def contraction(
     Returns
     -------
     Contraction or None
-        Of the run in which states come together least; None where no rollout completed.
+        Of the run in which states come together least; None where no rollout completed, or none of
+        them is measured.
     """
     s = model.signals
     names = s.names("observed")
@@ -100,7 +101,7 @@ def contraction(
         for run, rollout in zip(runs, rollouts, strict=True)
         if rollout.status is Status.COMPLETED
     ]
-    if not pairs:
+    if not pairs or not names:
         return None
     with hushed():
         shifted = simulate(

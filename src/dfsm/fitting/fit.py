@@ -33,6 +33,7 @@ from dfsm.fitting.corrective import NoCorrection, fit_corrective
 from dfsm.fitting.doubts import Doubts, doubts
 from dfsm.fitting.gate import correct, left_over, predicted
 from dfsm.fitting.hidden.advice import hidden_advice
+from dfsm.fitting.hidden.assembled import with_fitted
 from dfsm.fitting.hidden.build import fit_hidden, require_hidden
 from dfsm.fitting.known import fitted_rows, known_coefficients
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
@@ -172,10 +173,11 @@ def fit(
             seen = along_rollouts(model, data, recorded, settings)
     with _timed(seconds, "outputs"):
         g = _fit_outputs(seen, settings)
-        e_g = correct(seen, seen.output_inputs, seen.outputs, g, settings) if g else None
+        targets = seen.outputs[:, : len(settings.outputs)]
+        e_g = correct(seen, seen.output_inputs, targets, g, settings) if g else None
     model = replace(
         model,
-        g=g.model if g else None,
+        g=with_fitted(model.g, g.model if g else None),
         e_g=e_g.function if e_g else None,
         corrected_outputs=e_g.rows if e_g else (),
     )
@@ -312,7 +314,7 @@ def _account(
 def _fit_outputs(samples: Samples, settings: FitSettings) -> LinearFit | None:
     if not settings.outputs:
         return None
-    every = range(samples.outputs.shape[1])
+    every = range(len(settings.outputs))
     return _linear(samples, samples.output_inputs, samples.outputs, settings, every)
 
 

@@ -108,7 +108,7 @@ def correct(
     else:
         large = []
     decisions = []
-    for i, (name, unit) in enumerate(_target_names(samples, derivatives)):
+    for i, (name, unit) in enumerate(_target_names(samples, derivatives)[: len(ratio)]):
         if i in known:
             text = "kinematic, its rate is a state"
         elif i in mechanics:

@@ -6,6 +6,7 @@ states exist nowhere else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,9 +28,27 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSett
     for run in data:
         inside = np.isin(run.time, run.window(known_from(run, settings), settings.stop).time)
         paths.append(latents_along(model, run)[inside])
-    at = model.signals.observed_columns.stop
-    inputs = np.insert(samples.inputs, [at] * len(model.signals.latents), np.concatenate(paths), 1)
-    return replace(samples, inputs=inputs, signals=model.signals)
+    s = model.signals
+    if s.telling:
+        samples = _with_outputs(samples, s.telling)
+    at = s.observed_columns.stop
+    inputs = np.insert(samples.inputs, [at] * len(s.latents), np.concatenate(paths), 1)
+    return replace(samples, inputs=inputs, signals=s, terms=model.terms)
+
+
+def _with_outputs(samples: Samples, names: Sequence[str]) -> Samples:
+    """The samples where measured states have become outputs of hidden ones."""
+    s = samples.signals
+    gone = [i for i, c in enumerate(s.states) if c.name in names]
+    columns = np.array(gone) + s.state_columns.start
+    seen = [samples.inputs[rows][:, columns] for rows in samples.parts]
+    return replace(
+        samples,
+        inputs=np.delete(samples.inputs, columns, axis=1),
+        recorded=tuple(np.column_stack(pair) for pair in zip(samples.recorded, seen, strict=True)),
+        derivatives=np.delete(samples.derivatives, gone, axis=1),
+        derivative_names=tuple(n for i, n in enumerate(samples.derivative_names) if i not in gone),
+    )
 
 
 def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSettings) -> Samples:
@@ -37,8 +56,9 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
 
     A run whose rollout ends early keeps its recorded states. `samples` come from `with_latents`.
     """
-    # Its outputs are what is going to be fitted.
-    model = replace(model, signals=replace(model.signals, outputs=()))
+    if not model.signals.telling:
+        # Its outputs are what is going to be fitted.
+        model = replace(model, signals=replace(model.signals, outputs=()))
     with hushed():
         rollouts = simulate(model, list(data), start=settings.start, stop=settings.stop)
     inputs = samples.inputs.copy()

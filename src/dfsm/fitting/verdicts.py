@@ -81,8 +81,9 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
     states = samples.inputs[:, columns]
     names = [c.name for c in samples.signals.states][: states.shape[1]]
     measured = [spec.name for spec in settings.states]
-    recorded = {n: states[:, names.index(n)] for n in measured}
-    recorded |= {n: v for n, v in zip(settings.outputs, samples.outputs.T, strict=True)}
+    outputs = dict(zip(samples.signals.names("outputs"), samples.outputs.T, strict=True))
+    recorded = {n: outputs[n] if n in outputs else states[:, names.index(n)] for n in measured}
+    recorded |= outputs
     ended = [s for s in evidence.rollouts.values() if s.status is not Status.COMPLETED]
     entries = []
     for name, values in recorded.items():

@@ -110,7 +110,11 @@ def _check_signals(s: SignalTable) -> None:
         raise ValueError("signals, of which two have one name")
     if len(s.latents) > len(s.states) or s.states[len(s.states) - len(s.latents) :] != s.latents:
         raise ValueError("latents, which are not the last states")
-    _equal("states", [c.name for c in s.observed], [*state_names(s.specs)])
+    if not set(s.telling) <= set(s.names("outputs")):
+        raise ValueError("telling, of which some are no outputs")
+    told_by_outputs = s.telling and not s.specs
+    expected = [] if told_by_outputs else [*state_names(s.specs)]
+    _equal("states", [c.name for c in s.observed], expected)
     if s.azimuth is not None:
         _ = s.azimuth_rate
         _equal("field", list(s.names("field")), list(s.azimuth.field))

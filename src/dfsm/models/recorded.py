@@ -78,6 +78,10 @@ def recorded_states(model: DFSM, run: Trajectory, start: float | None = None) ->
         First time in s at which states are wanted; what lies well before has no say, see `lead_in`.
     """
     s = model.signals
+    if not s.specs:
+        # All states are hidden.
+        none = np.zeros((len(run), 0))
+        return Recorded(Differentiated(run, (), none, (), (), (), np.zeros(0, bool)), None, None)
     run = lead_in(run, start, s.derivatives)
     kinds = s.between_samples()
     breaks = jumps(run, s.driving, kinds[: len(s.driving)])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from collections.abc import Sequence
+from dataclasses import field, replace
 
 import equinox as eqx
 import jax
@@ -59,6 +60,16 @@ class Region(eqx.Module):
     whitening: jax.Array = field(default_factory=lambda: from_host(np.zeros((0, 0, 0))))
     fixed: int = eqx.field(static=True, default=0)
     schedule: int | None = eqx.field(static=True, default=None)
+
+    def without(self, columns: Sequence[int]) -> Region:
+        """The region of fewer inputs: some count no more."""
+
+        def fewer(values: jax.Array) -> jax.Array:
+            return from_host(np.delete(values, columns, axis=-1))
+
+        parts = {n: fewer(getattr(self, n)) for n in ("low", "high", "mean", "std", "operating")}
+        whitening = fewer(self.whitening) if self.whitening.size else self.whitening
+        return replace(self, **parts, whitening=whitening)
 
     @property
     def scale(self) -> jax.Array:

@@ -128,6 +128,8 @@ class SignalTable:
     startup
         Length in s of the record from which hidden states are told, see `simulation.hidden`; 0
         where latent states follow from the inputs alone, see `latents.py`.
+    telling
+        Names of outputs that tell hidden states beside the measured ones.
     step
         In s, of the integration that the model was fitted with; None for one fitted on derivatives.
     specs
@@ -157,6 +159,7 @@ class SignalTable:
     field: tuple[Channel, ...] = ()
     between: tuple[Between, ...] = ()
     startup: float = 0.0
+    telling: tuple[str, ...] = ()
     step: float | None = None
 
     @property
@@ -209,7 +212,8 @@ class SignalTable:
     @property
     def measured(self) -> tuple[str, ...]:
         """Names of the channels that an initial state is taken from."""
-        return tuple(n for s in self.specs for n in (s.name, s.rate) if n is not None)
+        states = (n for s in self.specs for n in (s.name, s.rate) if n is not None)
+        return (*states, *self.telling)
 
     @property
     def recorded(self) -> tuple[str, ...]:

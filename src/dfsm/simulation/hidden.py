@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,6 +23,8 @@ from dfsm.errors import DfsmError
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latent_path, latent_state
+from dfsm.models.signals import GROUPS
+from dfsm.models.terms.sensor import Sensor, SensorTerm
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 from dfsm.simulation.integrate import Stages, mesh_of, rk4, stages_of
 
@@ -94,7 +96,10 @@ def told_state(model: DFSM, run: Trajectory, start: float) -> Array:
 
 @dataclass(frozen=True)
 class _Past:
-    """A window of a record: steps, inputs along them, and what was measured at every so many."""
+    """A window of a record: steps, inputs along them, and what was measured at every so many.
+
+    Measured states come first, then outputs that tell hidden ones.
+    """
 
     h: Array
     drive: tuple[Array, Array, Array]
@@ -110,7 +115,7 @@ class _Past:
             part.reshape(-1, part.shape[-1])
             for part in stages_of(driven, s.between_samples(), every)
         )
-        names = s.names("states")[: len(s.observed)]
+        names = (*s.names("observed"), *s.telling)
         y = window.select(names).require_finite().values if measured else np.empty((0, len(names)))
         h = np.repeat(np.diff(driven.time) / every, every)
         return cls(h, (begin, middle, end), every, y)
@@ -122,11 +127,42 @@ class _Past:
     def solved(self, model: DFSM) -> Array:
         """The state at the beginning that meets what was measured best."""
         problem = _StartError(model, self)
-        steps = LevenbergMarquardt(problem, Step(problem.first), 0.0)
-        best = problem.first
-        for step in islice(steps, _ITERATIONS):
-            best = step.weights
-        return problem.state(best)
+        found = []
+        for best in problem.firsts:
+            for step in islice(LevenbergMarquardt(problem, Step(best), 0.0), _ITERATIONS):
+                best = step.weights
+            found.append(best)
+        # Where an instrument loses a sign, both are tried.
+        return problem.state(found[0] if len(found) == 1 else min(found, key=problem.cost))
+
+
+class _Seen(NamedTuple):
+    """What is measured of states: some as they are, and outputs gain · φ + offset of others."""
+
+    states: int
+    sensors: tuple[Sensor, ...]
+    columns: list[int]
+    gains: Array
+    offsets: Array
+    std: Array
+
+    @classmethod
+    def of(cls, model: DFSM) -> _Seen:
+        s, terms = model.signals, model.terms
+        if terms is None or model.g is None or not s.telling:
+            none = np.zeros(0)
+            return cls(len(s.observed), (), [], none, none, none)
+        rows = [s.names("outputs").index(n) for n in s.telling]
+        parts = [part for part in terms.parts if isinstance(part, SensorTerm)]
+        gains = np.asarray(model.g.coefficients)[0, rows, len(s.inputs) + np.arange(len(rows))]
+        return cls(
+            len(s.observed),
+            tuple(part.sensor for part in parts),
+            [part.columns[0] - s.state_columns.start for part in parts],
+            gains,
+            np.asarray(model.g.offsets)[0, rows],
+            np.asarray(terms.std),
+        )
 
 
 class _StartError:
@@ -137,10 +173,15 @@ class _StartError:
         columns, region = model.signals.state_columns, model.region
         self._mean = np.asarray(region.mean)[columns]
         self._scale = np.asarray(region.scale)[columns]
-        self._observed = len(model.signals.observed)
-        self.first = np.zeros(len(self._mean))
-        at = slice(self._observed)
-        self.first[at] = (past.measured[0] - self._mean[at]) / self._scale[at]
+        seen = _Seen.of(model)
+        self._spread = np.concatenate([self._scale[: seen.states], seen.gains * seen.std])
+        states = np.tile(self._mean, (2, 1))
+        states[:, : seen.states] = past.measured[0, : seen.states]
+        for k, (sensor, column) in enumerate(zip(seen.sensors, seen.columns, strict=True)):
+            value = (past.measured[0, seen.states + k] - seen.offsets[k]) / seen.gains[k]
+            states[:, column] = sensor.behind(value)
+        first, other = (states - self._mean) / self._scale
+        self.firsts = [first] if np.array_equal(first, other) else [first, other]
 
     def state(self, weights: Array) -> Array:
         return self._mean + self._scale * weights
@@ -164,7 +205,7 @@ class _StartError:
     @property
     def _given(self) -> tuple[Any, ...]:
         p = self._past
-        return self._mean, self._scale, p.h, p.drive, p.measured
+        return self._mean, self._scale, self._spread, p.h, p.drive, p.measured
 
 
 @eqx.filter_jit
@@ -178,16 +219,24 @@ def _errors(
     w: jax.Array,
     mean: Array,
     scale: Array,
+    spread: Array,
     h: Array,
     drive: _Drive,
     y: Array,
 ) -> jax.Array:
-    observed, every = y.shape[1], len(h) // max(1, len(y) - 1)
+    observed, every = len(model.signals.observed), len(h) // max(1, len(y) - 1)
     along = _stages(drive)
     xs = rk4(model.prepared(), jnp.asarray(mean + scale * w), jnp.asarray(h), along, _BOUND)[
         ::every
     ]
-    r = (xs[:, :observed] - y) / scale[:observed]
+    seen = xs[:, :observed]
+    if model.signals.telling:
+        # Instruments see states alone.
+        none = [jnp.zeros(len(model.signals.names(g))) for g in GROUPS if g != "states"]
+        at = [model.signals.names("outputs").index(n) for n in model.signals.telling]
+        outputs = model.output(xs, *none)[:, jnp.array(at)]
+        seen = jnp.concatenate([seen, outputs], axis=1)
+    r = (seen - y) / spread
     return jnp.concatenate([r.ravel(), _PRIOR * w[observed:]])
 
 

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dfsm.core.host import from_host
-from dfsm.core.types import Array, IntArray
 from dfsm.data.dataset import Dataset
-from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.fitting.hidden.error import HiddenError
+from dfsm.fitting.hidden.assembled import assembled
 from dfsm.fitting.hidden.form import Form
 from dfsm.fitting.hidden.search import Found, search
 from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.settings import FitSettings
-from dfsm.models.corrective import Corrective, Perceptron, Polynomial
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import with_columns
-from dfsm.models.linear import LinearModel
 from dfsm.models.signals import Provenance
 
 # Samples of the past from which hidden states are told, and fewest samples per parameter.
@@ -92,12 +88,14 @@ def fit_hidden(model: DFSM, data: Dataset, settings: FitSettings, hidden: Hidden
         for n, kind in zip(s.exogenous, s.between_samples(), strict=True)
     ]
     found = search(records, len(s.states), s.between_samples(), free, hidden, settings.seed)
-    built = _built(model, found, startup)
+    built = assembled(model, found, startup)
     notes, checks = _told(found, hidden, [n for n, f in zip(s.exogenous, free, strict=True) if f])
+    checks += _instruments(found, s.names("states"))
     record = {
         "hidden": {
             "count": found.best.form.states - found.best.form.outputs,
             "form": found.best.form.kind,
+            "outputs": [sensor.sensing for sensor in found.best.form.sensors],
             "left_out": _root(found.best.error),
             "by_count": {str(k): _root(v) for k, v in found.gains.items()},
             "tried": [{"form": f, "count": c, "left_out": _root(e)} for f, c, e in found.tried],
@@ -173,83 +171,6 @@ def _require_apart(record: Trajectory, names: tuple[str, ...]) -> None:
                     )
 
 
-# -- the model ----------------------------------------------------------------------------------
-
-
-def _built(model: DFSM, found: Found, startup: float) -> DFSM:
-    s, form = model.signals, found.best.form
-    count = form.states - form.outputs
-    hidden = tuple(Channel(f"hidden{k + 1}", "-") for k in range(count))
-    table = replace(
-        s,
-        states=(*s.states, *hidden),
-        latents=hidden,
-        between=found.kinds[: len(s.driving)],
-        startup=startup,
-        step=found.standard.step / found.steps,
-    )
-    names = [c.name for c in table.inputs]
-    places = np.array([names.index(n) for n in (*table.names("states"), *s.exogenous)])
-    f, e = _equation(found, places)
-    paths = HiddenError(form, found.windows).paths(found.best.weights)
-    seen = paths[found.windows.used > 0][:, form.outputs :]
-    region = with_columns(model.region, s.state_columns.stop, seen)
-    return replace(
-        model,
-        f=f,
-        e=e,
-        region=region,
-        corrected=() if e is None else tuple(range(form.states)),
-        signals=table,
-    )
-
-
-def _equation(found: Found, places: IntArray) -> tuple[LinearModel, Corrective | None]:
-    """Linear and corrective part in physical units, inputs in the order of a model."""
-    form, standard = found.best.form, found.standard
-    none = np.zeros(form.states - form.outputs)
-    mean_x, scale_x = (
-        np.concatenate([a, none + b]) for a, b in zip(standard.outputs, (0, 1), strict=True)
-    )
-    mean = np.concatenate([mean_x, standard.inputs[0]])
-    scale = np.concatenate([scale_x, standard.inputs[1]])
-    rate = scale_x / standard.step
-    L, *others = map(np.asarray, form.parts(found.best.parameters))
-    slopes = rate[:, None] * L[:, :-1] / scale
-    coefficients = np.zeros_like(slopes)
-    coefficients[:, places] = slopes
-    offsets = rate * L[:, -1] - slopes @ mean
-    grid, *linear = map(from_host, (np.zeros(1), coefficients[None], offsets[None]))
-    f = LinearModel(grid, linear[0], linear[1], None)
-    shift, spread = np.zeros(len(places)), np.ones(len(places))
-    shift[places], spread[places] = mean, scale
-    return f, _corrective(form, others, (places, rate), (shift, spread))
-
-
-def _corrective(
-    form: Form,
-    parts: list[Array],
-    to: tuple[IntArray, Array],
-    standard: tuple[Array, Array],
-) -> Corrective | None:
-    (places, rate), (shift, scale) = to, map(from_host, standard)
-    if form.kind == "polynomial":
-        columns = [*places.tolist(), len(places)]
-        factors = tuple(tuple(columns[c] for c in f) for f in form.factors)
-        weights = from_host(rate[:, None] * parts[0])
-        return Polynomial(shift, scale, weights, factors, form.reach)
-    if form.kind == "tanh":
-        directions = np.zeros((form.units, len(places)))
-        directions[:, places] = parts[0][:, :-1]
-        return Perceptron(
-            shift,
-            scale,
-            weights=(from_host(directions), from_host(rate[:, None] * parts[1])),
-            biases=(from_host(parts[0][:, -1]), from_host(np.zeros(form.states))),
-        )
-    return None
-
-
 # -- what is told -------------------------------------------------------------------------------
 
 
@@ -280,6 +201,25 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
             "with half as many, what the integration adds would be learned"
         )
     return _doubts(found, hidden), checks
+
+
+def _instruments(found: Found, names: Sequence[str]) -> list[str]:
+    """What instruments make of states."""
+    standard, told = found.standard, []
+    for k, sensor in enumerate(found.best.form.sensors):
+        mean, scale = standard.outputs[0][k], standard.outputs[1][k]
+        if sensor.folds:
+            level = mean + scale * found.best.parameters[k - found.best.form.outputs]
+            what = "absolute value" if sensor.sensing == "absolute" else "square"
+            side = "above" if sensor.up > 0 else "below"
+            way = f"the {what} of a hidden state, {side} {level:.3g}"
+        elif sensor.sensing == "clipped":
+            ends = [f"{mean + scale * e:.4g}" for e in (sensor.low, sensor.high) if np.isfinite(e)]
+            way = f"a hidden state, as far as the instrument goes: to {' and '.join(ends)}"
+        else:
+            continue
+        told.append(f"{names[k]} is {way} (hidden.output: direct takes it for a state)")
+    return told
 
 
 def _degree(form: Form) -> int:

@@ -57,6 +57,9 @@ class HiddenError:
             columns = np.concatenate([np.arange(n), room + np.arange(form.inputs + 1)])
             width = self._computed.width + 1
             self._places = (width * np.arange(n)[:, None] + columns).ravel()
+            levels = form.size - len(self._places)
+            last = np.arange(self._computed.size - levels, self._computed.size)
+            self._places = np.concatenate([self._places, last])
 
     @property
     def size(self) -> int:
@@ -67,6 +70,11 @@ class HiddenError:
         """States along all windows, ``(window, time, state)``."""
         paths = np.concatenate(self._each(partial(_paths, self._computed), weights))
         return paths[..., : self.form.states]
+
+    def outputs(self, weights: Array) -> Array:
+        """Outputs along all windows, ``(window, time, output)``."""
+        levels = weights[self.form.size - self.form.outputs : self.form.size]
+        return self.form.seen(levels, self.paths(weights))
 
     def left_out(self, weights: Array) -> float:
         """Mean square of the errors where data are left out; 1 is as wrong as a constant."""
@@ -104,7 +112,7 @@ class HiddenError:
         return total / max(count, 1) if np.isfinite(total) else np.inf
 
     def _squares(self, weights: Array, share: Array) -> float:
-        r = self.paths(weights)[..., : self.form.outputs] - self.windows.y
+        r = self.outputs(weights) - self.windows.y
         return float(np.sum(r**2 * share[..., None]))
 
     def _each(self, function: Callable[..., Any], weights: Array) -> list[Any]:
@@ -178,6 +186,12 @@ def _products(
 
         return jnp.concatenate([first[None, : form.outputs], jax.lax.scan(step, first, (A, B))[1]])
 
-    J = jax.vmap(along)(A, B) * used[..., None, None]
-    r = (xs[..., : form.outputs] - y) * used[..., None]
+    J, seen = jax.vmap(along)(A, B), xs[..., : form.outputs]
+    if form.sensors:
+        levels = theta[p - form.outputs :]
+        seen, gains = jax.jvp(partial(form.seen, levels), (xs,), (jnp.ones_like(xs),))
+        folds = jnp.diag(jnp.array([float(s.folds) for s in form.sensors]))
+        J = (gains[..., None] * J).at[..., p - form.outputs : p].add(folds)
+    J = J * used[..., None, None]
+    r = (seen - y) * used[..., None]
     return jnp.einsum("wtoi,wtoj->wij", J, J), jnp.einsum("wtoi,wto->wi", J, r)

@@ -1,6 +1,6 @@
 """The equation of a model with hidden states, in standardised variables.
 
-    ẋ = A x + B v + b + e(x, v),      y = the first of x
+    ẋ = A x + B v + b + e(x, v),      y = what instruments make of the first of x
 
 e is nothing, a polynomial, or a layer of tanh units W₂ tanh(W₁ [x, v] + c). Where stability is
 asked for, A = P⁻¹ (S - R Rᵀ - ε P - |P W₂| |W₁| 1) with S skew, whatever R and S are: dᵀ P d of the
@@ -10,7 +10,7 @@ difference d of any two rollouts then falls by exp(-2 ε t) at least.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ import numpy as np
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.types import Array
 from dfsm.models.corrective.polynomial import REACH, monomials, products
+from dfsm.models.terms.sensor import Sensor
 from dfsm.numerics.runge_kutta import rk4_step
 
 Kind = Literal["none", "polynomial", "tanh"]
@@ -49,6 +50,8 @@ class Form:
     room
         States that linear rollouts are computed with, so that systems of all sizes share compiled
         code; those that there are not stay at zero.
+    sensors
+        What makes y of the first of x, a level added where it folds; empty where they are y.
     """
 
     states: int
@@ -61,6 +64,7 @@ class Form:
     margin: float = 0.0
     reach: float = REACH
     room: int = 0
+    sensors: tuple[Sensor, ...] = ()
 
     @property
     def width(self) -> int:
@@ -69,13 +73,13 @@ class Form:
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of the parameter arrays: [A, B, b] first."""
-        linear = [(self.states, self.width + 1)]
+        """Of the parameter arrays: [A, B, b] first, levels of outputs last where there are any."""
+        shapes: list[tuple[int, ...]] = [(self.states, self.width + 1)]
         if self.kind == "polynomial":
-            return [*linear, (self.states, len(self.factors))]
+            shapes.append((self.states, len(self.factors)))
         if self.kind == "tanh":
-            return [*linear, (self.units, self.width + 1), (self.states, self.units)]
-        return linear
+            shapes += [(self.units, self.width + 1), (self.states, self.units)]
+        return [*shapes, (self.outputs,)] if self.sensors else shapes
 
     @property
     def size(self) -> int:
@@ -113,6 +117,27 @@ class Form:
         if self.kind == "tanh":
             return total + parts[2] @ jnp.tanh(parts[1][:, :-1] @ z + parts[1][:, -1])
         return total
+
+    def seen(self, levels: Any, x: Any) -> Any:
+        """Outputs of states, ``(..., state)`` to ``(..., output)``, see `sensors`.
+
+        Arrays of NumPy or JAX.
+        """
+        if not self.sensors:
+            return x[..., : self.outputs]
+        seen = [
+            sensor.seen(x[..., k]) + (levels[k] if sensor.folds else 0.0)
+            for k, sensor in enumerate(self.sensors)
+        ]
+        return (np if isinstance(x, np.ndarray) else jnp).stack(seen, axis=-1)
+
+    @property
+    def weighed(self) -> Array:
+        """1 for parameters that are to be small and 0 for the others, ``(parameter,)``."""
+        weights = np.ones(self.size)
+        if self.sensors:
+            weights[-self.outputs :] = 0.0
+        return weights
 
     def interval(
         self, parts: list[jax.Array], x: jax.Array, h: jax.Array, v: jax.Array

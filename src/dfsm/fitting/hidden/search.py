@@ -19,9 +19,11 @@ from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.fitting.hidden.error import HiddenError
 from dfsm.fitting.hidden.form import Form, polynomial
+from dfsm.fitting.hidden.sensors import Sensed, as_recorded, behind, sensed
 from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.hidden.starts import (
     Candidate,
+    behind_sensors,
     contracting,
     improved,
     linear_start,
@@ -35,6 +37,8 @@ from dfsm.models.corrective.polynomial import REACH
 # A further hidden state must lower the squared error on data left out to this share; another
 # interpolation to this; and half the step must change rollouts by no more than this share of it.
 _WORTH_A_STATE, _WORTH_A_KIND, _STEP_ERROR = 0.7, 0.95, 0.01
+# What instruments make of outputs must lower that of linear systems to this.
+_WORTH_A_SENSOR = 0.7
 # Linear systems whose squared error is no more than so many times the least may be enough.
 _NEARLY = 2.0
 _MOST_STEPS = 8
@@ -108,7 +112,7 @@ def search(
     """
     standard, kinds = standard_of(records, outputs), tuple(kinds)
     windows = windows_of(records, standard, kinds, 1, settings.samples)
-    linear = _linear(records, standard, windows, settings)
+    linear = _behind(records, standard, (kinds, windows), settings)
     gains = {c: candidate.error for c, candidate in linear.items()}
     first = _promising(linear)[0]
     kinds, kinds_tried = _interpolation(
@@ -129,15 +133,38 @@ def search(
     return Found(final, standard, kinds, steps, everything, gains, tried, kinds_tried)
 
 
+def _behind(
+    records: Sequence[Trajectory],
+    standard: Standard,
+    drive: tuple[tuple[Between, ...], Windows],
+    settings: HiddenSettings,
+) -> dict[int, Candidate]:
+    """Linear systems by the number of hidden states, behind the instruments that records tell."""
+    kinds, windows = drive
+    told = sensed(records, standard, settings.output)
+    if told is None or settings.output is None:
+        plain = _linear(as_recorded(records), standard, (windows, windows), settings)
+        if told is None:
+            return plain
+    else:
+        plain = {}
+    unfolded = windows_of(told.records, standard, kinds, 1, settings.samples)
+    behind = _linear(told, standard, (unfolded, windows), settings)
+    least = min((c.error for c in plain.values()), default=np.inf)
+    return behind if min(c.error for c in behind.values()) < _WORTH_A_SENSOR * least else plain
+
+
 def _linear(
-    records: Sequence[Trajectory], standard: Standard, windows: Windows, settings: HiddenSettings
+    told: Sensed, standard: Standard, windows: tuple[Windows, Windows], settings: HiddenSettings
 ) -> dict[int, Candidate]:
     """Linear systems by the number of hidden states."""
     ny, nv = len(standard.outputs[0]), len(standard.inputs[0])
     counts = range(settings.most + 1) if settings.count is None else [settings.count]
-    found = subspace(records, standard, ny + max(counts))
-    room = ny + max(counts)
-    each = [linear_start(found, Form(ny + c, ny, nv, room=room), windows) for c in counts]
+    found = subspace(told.records, standard, ny + max(counts))
+    room, (unfolded, seen) = ny + max(counts), windows
+    each = [linear_start(found, Form(ny + c, ny, nv, room=room), unfolded) for c in counts]
+    if told.sensors:
+        each = [behind_sensors(c, told, seen) for c in each]
     if settings.stable is not None:
         margin = settings.stable * standard.step
         each = [contracting(c, margin) for c in each]
@@ -195,7 +222,8 @@ def _forms(
         return [(base, 0)]
     forms: list[tuple[Form, int]] = []
     there = windows.y[(windows.used + windows.left_out) > 0]
-    reach = max(REACH, _BEYOND * float(max(np.abs(there).max(), np.abs(windows.v).max())))
+    farthest = np.ptp(there, axis=0) if base.sensors else np.abs(there)
+    reach = max(REACH, _BEYOND * float(max(farthest.max(), np.abs(windows.v).max())))
     if settings.form in (None, "polynomial") and settings.stable is None:
         forms.append((polynomial(base, settings.degree, _MOST_MONOMIALS, reach), 0))
     if settings.form in (None, "tanh"):
@@ -246,9 +274,9 @@ def _steps(
     while steps < _MOST_STEPS:
         finer = windows_of(records, standard, kinds, 2 * steps, settings.samples)
         here = windows_of(records, standard, kinds, steps, settings.samples)
-        apart = HiddenError(best.form, here).paths(best.weights)
-        apart = apart - HiddenError(best.form, finer).paths(best.weights)
-        change = np.mean(np.sum(apart[..., : best.form.outputs] ** 2, -1))
+        apart = HiddenError(best.form, here).outputs(best.weights)
+        apart = apart - HiddenError(best.form, finer).outputs(best.weights)
+        change = np.mean(np.sum(apart**2, -1))
         if change <= _STEP_ERROR * best.error * best.form.outputs:
             break
         steps *= 2
@@ -261,11 +289,18 @@ def _restarted(best: Candidate, few: Windows, everything: Windows) -> Array:
     form = best.form
     if len(few.y) == len(everything.y):
         return best.weights
-    n = form.states
-    starts = np.zeros((len(everything.y), n))
-    starts[:, : form.outputs] = everything.y[:, 0]
-    weights = np.concatenate([best.parameters, starts.ravel()])
-    return started(form, weights, everything.heads(_HEAD))
+    n, heads = form.states, everything.heads(_HEAD)
+    tried, errors = [], []
+    for first in behind(form, best.parameters, everything.y[:, 0]):
+        starts = np.zeros((len(first), n))
+        starts[:, : form.outputs] = first
+        weights = np.concatenate([best.parameters, starts.ravel()])
+        weights = started(form, weights, heads)
+        apart = (HiddenError(form, heads).outputs(weights) - heads.y) * heads.used[..., None]
+        tried.append(weights[form.size :].reshape(-1, n))
+        errors.append(np.sum(apart**2, axis=(1, 2)))
+    least = np.argmin(errors, axis=0)
+    return np.concatenate([best.parameters, np.array(tried)[least, np.arange(len(least))].ravel()])
 
 
 def started(form: Form, weights: Array, windows: Windows, steps: int = 12) -> Array:

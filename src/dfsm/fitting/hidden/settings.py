@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from dfsm.core.settings import require, settings_class
+from dfsm.models.terms.sensor import Sensing
 
 # More hidden states than that no record of one output has told apart.
 _MOST = 20
@@ -23,6 +24,10 @@ class HiddenSettings:
     form
         What corrects all rows: ``"polynomial"``, ``"tanh"`` or ``"none"``; None takes what is best
         on data left out.
+    output
+        What instruments make of what they see: ``"direct"``, ``"absolute"`` or ``"square"``, which
+        lose its sign, or ``"clipped"``, which end at the ends of the record; None takes what is
+        best on data left out, where a record looks like one of these.
     units
         Tanh units.
     degree
@@ -46,6 +51,7 @@ class HiddenSettings:
     count: int | None = None
     most: int = 5
     form: Literal["polynomial", "tanh", "none"] | None = None
+    output: Sensing | None = None
     units: int = 6
     degree: int = 3
     starts: int = 10

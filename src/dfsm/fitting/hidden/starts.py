@@ -14,6 +14,7 @@ from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.fitting.hidden.error import HiddenError
 from dfsm.fitting.hidden.form import Form
+from dfsm.fitting.hidden.sensors import Sensed
 from dfsm.fitting.hidden.windows import Standard, Windows
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 from dfsm.numerics.subspace import Observability, observability, outputs_first, rate_of
@@ -64,6 +65,13 @@ def subspace(records: Sequence[Trajectory], standard: Standard, states: int) -> 
         pairs.append((z[:, ny:], z[:, :ny]))
         seen += len(z)
     return observability(pairs, states)
+
+
+def behind_sensors(start: Candidate, sensed: Sensed, windows: Windows) -> Candidate:
+    """A linear system of what instruments see, from one of what would be seen without them."""
+    form, p = replace(start.form, sensors=sensed.sensors), start.form.size
+    weights = np.concatenate([start.weights[:p], sensed.levels, start.weights[p:]])
+    return improved(form, windows, weights, 0.0, 20)
 
 
 def linear_start(found: Observability, form: Form, windows: Windows) -> Candidate:
@@ -133,7 +141,7 @@ def improved(form: Form, windows: Windows, weights: Array, decay: float, limit: 
     stage, count = -(-limit // _STAGES), 0
     for _ in range(_STAGES):
         # What the errors are decides what a parameter of one may cost.
-        weighed = HiddenError(form, windows, decay * error.trained(last))
+        weighed = HiddenError(form, windows, decay * error.trained(last) * form.weighed)
         for step in islice(LevenbergMarquardt(weighed, Step(last), 0.0), stage):
             count, last = count + 1, step.weights
             if 2 * count >= limit and (now := on_left_out(last)) <= least:
@@ -145,8 +153,7 @@ def improved(form: Form, windows: Windows, weights: Array, decay: float, limit: 
 
 def runs_away(candidate: Candidate, windows: Windows) -> bool:
     """Whether outputs go where none was recorded, under recorded inputs in the opposite order."""
-    paths = HiddenError(candidate.form, windows.reversed()).paths(candidate.weights)
-    outputs = paths[..., : candidate.form.outputs]
+    outputs = HiddenError(candidate.form, windows.reversed()).outputs(candidate.weights)
     recorded = windows.y[(windows.used + windows.left_out) > 0]
     middle = (recorded.max(axis=0) + recorded.min(axis=0)) / 2
     half = np.maximum(np.ptp(recorded, axis=0) / 2, 1e-12)
@@ -156,7 +163,8 @@ def runs_away(candidate: Candidate, windows: Windows) -> bool:
 def nonlinear_start(linear: Candidate, form: Form, seed: int) -> Array:
     """Weights of a form that does what a linear candidate does, with units drawn at random."""
     rng = np.random.default_rng(seed)
-    parts = [linear.parameters]
+    levels = form.outputs if form.sensors else 0
+    parts = [linear.parameters[: linear.form.size - levels]]
     if form.kind == "polynomial":
         parts.append(np.zeros(form.states * len(form.factors)))
     elif form.kind == "tanh":
@@ -164,7 +172,7 @@ def nonlinear_start(linear: Candidate, form: Form, seed: int) -> Array:
         middles = rng.uniform(-1, 1, (form.units, 1))
         parts += [np.concatenate([directions, middles], axis=1).ravel()]
         parts += [np.zeros(form.states * form.units)]
-    return np.concatenate([*parts, linear.weights[linear.form.size :]])
+    return np.concatenate([*parts, linear.weights[linear.form.size - levels :]])
 
 
 def contracting(linear: Candidate, margin: float) -> Candidate:
@@ -174,7 +182,8 @@ def contracting(linear: Candidate, margin: float) -> Candidate:
     hidden states have been turned so that it is; P of the measured ones stays as it is.
     """
     form, n, ny = linear.form, linear.form.states, linear.form.outputs
-    L = linear.parameters.reshape(n, -1).copy()
+    count = form.states * (form.width + 1)
+    L, levels = linear.parameters[:count].reshape(n, -1).copy(), linear.parameters[count:]
     starts = linear.weights[form.size :].reshape(-1, n)
     A = L[:, :n]
     growth = np.linalg.eigvals(A).real.max()
@@ -195,5 +204,6 @@ def contracting(linear: Candidate, margin: float) -> Candidate:
     skew = (P @ A - (P @ A).T) / 2
     M = np.tril(R) + np.triu(skew, 1)
     stable = replace(form, metric=tuple(map(tuple, P.tolist())), margin=margin, room=0)
-    weights = np.concatenate([np.concatenate([M, rest], axis=1).ravel(), starts.ravel()])
+    linear_part = np.concatenate([M, rest], axis=1).ravel()
+    weights = np.concatenate([linear_part, levels, starts.ravel()])
     return Candidate(stable, weights, linear.error, linear.steps)

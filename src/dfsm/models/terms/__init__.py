@@ -20,6 +20,7 @@ from dfsm.models.terms.product import Product, ProductTerm
 from dfsm.models.terms.quadratic_drag import QuadraticDrag, QuadraticDragTerm
 from dfsm.models.terms.rotor import Rotor
 from dfsm.models.terms.rotor_term import RotorTerm
+from dfsm.models.terms.sensor import SensorTerm
 from dfsm.models.terms.terms import Terms, TermSettings, terms_of
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "Rotor",
     "RotorTerm",
     "ScalarFunction",
+    "SensorTerm",
     "Term",
     "TermSettings",
     "Terms",
@@ -43,7 +45,8 @@ __all__ = [
 
 # By the kind that a model folder names.
 FORMS: Mapping[str, type[Term]] = {
-    form.kind: form for form in (RotorTerm, QuadraticDragTerm, ProductTerm, FunctionTerm)
+    form.kind: form
+    for form in (RotorTerm, QuadraticDragTerm, ProductTerm, FunctionTerm, SensorTerm)
 }
 
 
