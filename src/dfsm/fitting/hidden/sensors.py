@@ -16,8 +16,8 @@ from dfsm.numerics.folds import Unfolded, unfolded
 
 # Samples of every record that tell whether an output is folded.
 _LOOKED_AT = 4000
-# An output ends where it stays at one value for this share of the samples.
-_STAYS = 0.01
+# An output ends where it stays at one value for this share of the samples, and so many of them.
+_STAYS, _FEWEST = 0.01, 5
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ def _clipped(outputs: Sequence[Array], sensing: Sensing | None) -> tuple[float, 
     y = np.concatenate(outputs)
     ends = [float(y.min()), float(y.max())]
     within = 1e-6 * (ends[1] - ends[0])
-    stays = [float(np.mean(np.abs(y - end) <= within)) >= _STAYS for end in ends]
+    there = [int(np.sum(np.abs(y - end) <= within)) for end in ends]
+    stays = [count >= max(_FEWEST, _STAYS * len(y)) for count in there]
     if not any(stays) or not (ends[1] > ends[0] and sensing in (None, "clipped")):
         return None
     return ends[0] if stays[0] else -np.inf, ends[1] if stays[1] else np.inf
