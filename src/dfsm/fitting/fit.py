@@ -173,8 +173,7 @@ def fit(
             seen = along_rollouts(model, data, recorded, settings)
     with _timed(seconds, "outputs"):
         g = _fit_outputs(seen, settings)
-        own = slice(len(settings.outputs))
-        e_g = correct(seen, seen.output_inputs, seen.outputs[:, own], g, settings) if g else None
+        e_g = correct(seen, seen.output_inputs, seen.outputs, g, settings) if g else None
     model = replace(
         model,
         g=with_fitted(model.g, g.model if g else None),

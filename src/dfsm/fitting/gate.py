@@ -82,11 +82,13 @@ def correct(
     -------
     Correction
     """
+    derivatives = targets is samples.derivatives
+    # Outputs of hidden states, which nothing is to correct, come after those that were fitted.
+    targets = targets[:, : linear.model.coefficients.shape[1]]
     residuals = left_over(linear.model, samples, inputs, targets, range(targets.shape[1]))
     rms = rms_over(residuals, samples.weights)
     std = std_over(targets, samples.weights)
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
-    derivatives = targets is samples.derivatives
     known = kinematic_rows(settings.states) if derivatives else {}
     mechanics = set(linear.model.complete()) - set(known)
     large = [
