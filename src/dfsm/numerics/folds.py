@@ -42,7 +42,7 @@ class Unfolded(NamedTuple):
         Whether it is told so much better than |x| that something folded it.
     """
 
-    paths: list[Array]
+    paths: Sequence[Array]
     level: float
     up: int
     power: int

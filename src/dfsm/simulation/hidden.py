@@ -22,8 +22,8 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
+from dfsm.models.inputs import GROUPS
 from dfsm.models.latents import latent_path, latent_state
-from dfsm.models.signals import GROUPS
 from dfsm.models.terms.sensor import Sensor, SensorTerm
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 from dfsm.simulation.integrate import Stages, mesh_of, rk4, stages_of

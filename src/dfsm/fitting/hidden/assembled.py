@@ -122,7 +122,7 @@ def _seen(found: Found, behind: list[int], sizes: tuple[int, int]) -> LinearMode
     for place, k in enumerate(behind):
         rows[others + place, inputs + place] = scale[k]
         offsets[others + place] = mean[k] + scale[k] * levels[k] * form.sensors[k].folds
-    return LinearModel(*map(from_host, (np.zeros(1), rows[None], offsets[None])), None)
+    return _linear(rows, offsets)
 
 
 def _equation(
@@ -146,12 +146,16 @@ def _equation(
     coefficients = np.zeros_like(slopes)
     coefficients[:, at] = slopes
     offsets = rate * L[:, -1] - slopes @ mean
-    L, b = coefficients[order][None], offsets[order][None]
-    f = LinearModel(*map(from_host, (np.zeros(1), L, b)), None)
+    f = _linear(coefficients[order], offsets[order])
     shift, spread = np.zeros(len(at)), np.ones(len(at))
     shift[at], spread[at] = mean, scale
     e = _corrective(form, others, (at, rate), (shift, spread))
     return f, None if e is None else e.select(order)
+
+
+def _linear(coefficients: Array, offsets: Array) -> LinearModel:
+    grid = from_host(np.zeros(1))
+    return LinearModel(grid, from_host(coefficients[None]), from_host(offsets[None]), None)
 
 
 def _corrective(
