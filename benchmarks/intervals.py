@@ -98,7 +98,7 @@ def _turbine() -> Case:
     turbine, rotor = demo(), neighbour("rotor_model")
     training = [*turbine.runs(rotor.WINDS, range(1, 3)), *turbine.perturbed(testing=False)]
     base = rotor.settings(())
-    table = replace(base.terms[0], memory="speed", uncertainty=0.0)
+    table = replace(base.terms[0], memory="speed", induction="steady", uncertainty=0.0)
     bare = {"corrective": dfsm.NoCorrection(), "azimuth": None, "outputs": ("TwrBsMyt",)}
     return Case(
         training,

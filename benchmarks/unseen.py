@@ -45,16 +45,21 @@ def run() -> dict[str, Any]:
         terms = (replace(term, **changes) for term in settings.terms)
         return replace(settings, **bare, terms=tuple(terms))
 
-    table = with_rotor(rotor.settings(()), memory="speed", uncertainty=0.0)
-    rings = with_rotor(whole, memory="speed", uncertainty=0.0)
-    through_wind = with_rotor(whole, uncertainty=0.0)
+    steady = {"induction": "steady", "uncertainty": 0.0}
+    table = with_rotor(rotor.settings(()), memory="speed", **steady)
+    rings = with_rotor(whole, memory="speed", **steady)
+    through_wind = with_rotor(whole, **steady)
+    factors = with_rotor(whole, induction="steady")
+    by_pitch = replace(turbine.REFINEMENT, network=0)
     results = {}
     for name, settings, refinement in (
         ("the demo's model", plain, turbine.REFINEMENT),
-        ("the rotor's table instead of a schedule and a network", table, rotor.REFINEMENT),
-        ("and the wind over six rings", rings, rotor.REFINEMENT),
-        ("and latent states that change the wind at the rotor", through_wind, rotor.REFINEMENT),
-        ("and smooth factors of the table", whole, rotor.REFINEMENT),
+        ("the rotor's table instead of a schedule and a network", table, by_pitch),
+        ("and the wind over six rings", rings, by_pitch),
+        ("and latent states that change the wind at the rotor", through_wind, by_pitch),
+        ("and smooth factors of the table", factors, by_pitch),
+        ("and latent states of wind and waves alone", factors, rotor.REFINEMENT),
+        ("and induced velocities that lag", whole, rotor.REFINEMENT),
     ):
         begin = time.perf_counter()
         with warnings.catch_warnings():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fits
-from dfsm.errors import DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.corrective.rbf import RBF
 from dfsm.fitting.fit import fit
@@ -114,6 +114,12 @@ def test_the_gate_decides_which_rows_are_corrected(duffing, duffing_runs):
     assert off.e is None
     assert off.e_g is None
     assert "switched off" in decision(off, "q_ddot")["decision"]
+    some = fit(duffing_runs, replace(choices, corrected=("y",))).model
+    assert some.corrected == ()
+    assert some.corrected_outputs == (0,)
+    assert "not among 'corrected'" in decision(some, "q_ddot")["decision"]
+    with pytest.raises(DfsmError, match=r"corrected names 'q_dot_dott'.*q_ddot"):
+        fit(duffing_runs, replace(choices, corrected=("q_dot_dott",)))
 
 
 def test_lpv_interpolates_a_system_linear_in_its_schedule(scheduled):

@@ -61,6 +61,7 @@ def rotor(rings: Sequence[str] = RINGS) -> dfsm.Rotor:
         corrections=tuple(f"{ring}-RotWind" for ring in rings),
         inertia=318.6e6,  # with the generator
         generator_torque="GenTq",
+        induction="lag",
         memory="wind",
         uncertainty=0.1,
     )
@@ -74,6 +75,7 @@ def settings(rings: Sequence[str] = RINGS) -> dfsm.FitSettings:
         full,
         features=(*full.features, *excess),
         terms=(rotor(rings),),
+        corrected=full.outputs,
         linear=dfsm.LPV(
             schedule="RotWind",
             points=9,
@@ -83,8 +85,16 @@ def settings(rings: Sequence[str] = RINGS) -> dfsm.FitSettings:
     )
 
 
-# As the demo's, but for the network: the table does its work.
-REFINEMENT = replace(demo.REFINEMENT, network=0)
+# As the demo's, but for the network: the table does its work. What is remembered is wind and waves
+# alone, not the controller's answer to them, so that the model holds for other controls.
+REFINEMENT = replace(
+    demo.REFINEMENT,
+    network=0,
+    latent_inputs=(
+        *("RotWind", "RotShearV", "RotShearH", "Wave1Elev", "Wave1Elev_dot"),
+        *(f"{ring}-RotWind" for ring in RINGS),
+    ),
+)
 
 
 def main() -> None:

@@ -141,6 +141,7 @@ class Config(Strict):
     terms: list[Annotated[TermSettings, Field(discriminator="kind")]] = Field(default_factory=list)
     corrective: Annotated[CorrectiveSettings, Field(discriminator="kind")] = MLP()
     gate: float = FitSettings.gate
+    corrected: tuple[str, ...] | None = FitSettings.corrected
     azimuth: Azimuth | None = None
     inputs: Between | dict[str, Between] | None = None
     nonlinear_only: bool = FitSettings.nonlinear_only
@@ -175,6 +176,7 @@ class Config(Strict):
             terms=tuple(self._rooted(term) for term in self.terms),
             corrective=self.corrective,
             gate=self.gate,
+            corrected=self.corrected,
             azimuth=self.azimuth,
             inputs=self.inputs,
             nonlinear_only=self.nonlinear_only,

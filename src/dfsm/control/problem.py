@@ -28,7 +28,8 @@ from dfsm.errors import DfsmError, near_matches
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import latents_at, poles
-from dfsm.simulation.hidden import latents_from_past
+from dfsm.models.wakes import wakes_where
+from dfsm.simulation.hidden import pairs_from_past
 from dfsm.simulators import ODESystem
 
 
@@ -191,19 +192,34 @@ class OptimalControlProblem:
         """Latent states at the first time by name, one per scenario; None where that is free."""
         if not isinstance(self.model, DFSM) or not self.latents:
             return {}
-        signals = self.model.signals
-        driving = (*signals.driving, *(signals.measured if signals.startup else ()))
-        known = [
-            latents_from_past(self.model, run, self.start)
-            if run is not None and all(n in run for n in driving)
-            else None
-            for run in self.scenarios
-        ]
+        known = [self._latents_at_start(self.model, run) for run in self.scenarios]
         return {
-            name: [None if values is None else float(values[k]) for values in known]
+            name: [values[k] for values in known]
             for k, name in enumerate(self.latents)
             if name not in self.initial
         }
+
+    def _latents_at_start(self, model: DFSM, run: Trajectory | None) -> list[float | None]:
+        """Latent states that what was recorded before the first time has left behind.
+
+        Induced velocities have settled to the recorded state, or to the one that is asked for.
+        """
+        s = model.signals
+        driving = (*s.driving, *(s.measured if s.startup else ()))
+        if run is None or not all(n in run for n in driving):
+            pairs: list[float | None] = [None] * (len(s.latents) - s.induced)
+        else:
+            pairs = [float(v) for v in pairs_from_past(model, run, self.start)]
+        if not s.induced:
+            return pairs
+        known = dict[str, float]()
+        if run is not None:
+            now = int(np.argmin(np.abs(run.time - self.start)))
+            known = {c.name: float(run[c.name][now]) for c in s.inputs if c.name in run}
+        for name in self.initial:
+            low, high = self.end_limits("initial", name)
+            known |= {name: low} if low == high else {}
+        return [*wakes_where(model, known).tolist(), *pairs]
 
     def latent_paths(self, time: Array) -> dict[str, Array]:
         """Latent states that disturbances alone drive, at times in s, by name.
@@ -221,9 +237,9 @@ class OptimalControlProblem:
         if self.model.signals.startup:
             return {}
         chosen = np.asarray(poles(self.model).drive)[:, : len(self.plant.names("controls"))]
-        asked = {*self.bounds, *self.final}
+        asked, pairs = {*self.bounds, *self.final}, [c.name for c in self.model.signals.pairs]
         known = []
-        for *pair, drive in zip(self.latents[::2], self.latents[1::2], chosen, strict=True):
+        for *pair, drive in zip(pairs[::2], pairs[1::2], chosen, strict=True):
             starts = [v for n in pair for v in self.latent_starts.get(n, [None])]
             if not (drive.any() or None in starts or asked & {*pair}):
                 known += pair
@@ -231,7 +247,7 @@ class OptimalControlProblem:
             return {}
         runs = [run for run in self.scenarios if run is not None]
         paths = np.stack([latents_at(self.model, run, time) for run in runs])
-        return {name: paths[..., self.latents.index(name)] for name in known}
+        return {name: paths[..., pairs.index(name)] for name in known}
 
     @property
     def scenario_weights(self) -> Array:

@@ -43,8 +43,9 @@ def check(
             "the fitted model is not finite on its own training samples: fewer "
             "corrective.samples, or another corrective.kind, may cure it"
         )
-    columns = samples.signals.state_columns
-    errors = None if doubt.outdated else doubt.errors[:, columns]
+    # Nothing of what moves the latent states was fitted on derivatives.
+    known = doubt.errors[:, samples.signals.observed_columns]
+    errors = None if doubt.outdated else np.pad(known, (0, len(samples.signals.latents)))
     longest = max(run.window(settings.start, settings.stop).duration for run in data)
     growing = growths(model, longest, errors)
     if unstable := [g for g in growing if g.unstable]:

@@ -78,7 +78,7 @@ def contraction(
     Parameters
     ----------
     model
-        With or without corrective functions. Its latent states follow from inputs alone and are
+        With or without corrective functions. Its latent pairs follow from inputs alone and are
         the same in both rollouts of a pair.
     runs
         Training runs.

@@ -27,6 +27,8 @@ from dfsm.fitting.rough_inputs import rough_note
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.standard_errors import standard_errors
+from dfsm.models.dfsm import DFSM
+from dfsm.models.latents import poles
 from dfsm.numerics.time_mesh import std_over
 
 # A coefficient matters where its input makes so much of a row, and is not known where it is less
@@ -160,6 +162,36 @@ def doubts(
                     )
                 )
     return Doubts(tuple(notes), errors, tuple(reasons))
+
+
+def memory_doubt(model: DFSM) -> list[str]:
+    """What latent states learn that controls drive is the controller's of the runs.
+
+    It answers the very wind and waves that latent states stand for, and they take the answer for
+    the cause: right along runs of that controller, wrong with other gains and in an optimum.
+
+    Parameters
+    ----------
+    model
+        The refined model.
+
+    Returns
+    -------
+    list of str
+        At most one sentence.
+    """
+    signals = model.signals
+    if not signals.latents or signals.startup:
+        return []
+    drives = np.abs(np.asarray(poles(model).drive)).max(axis=0) > 0
+    names = [c.name for c, driven in zip(signals.controls, drives, strict=False) if driven]
+    if not names or not signals.disturbances:
+        return []
+    return [
+        f"latent states answer {', '.join(names)}: if a controller chose that in training, they "
+        "take its answer to disturbances for their cause; for other gains and optimal control let "
+        "disturbances alone drive them (refine.latent_inputs)"
+    ]
 
 
 def _evenly(samples: Samples, inputs: Array, left: Array) -> tuple[Array, Array, list[slice]]:

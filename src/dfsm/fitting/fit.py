@@ -30,17 +30,18 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, DfsmWarning, hushed
 from dfsm.fitting.checks import check
 from dfsm.fitting.corrective import NoCorrection, fit_corrective
-from dfsm.fitting.doubts import Doubts, doubts
+from dfsm.fitting.doubts import Doubts, doubts, memory_doubt
 from dfsm.fitting.gate import correct, left_over, predicted
 from dfsm.fitting.hidden.advice import hidden_advice
 from dfsm.fitting.hidden.assembled import with_fitted
 from dfsm.fitting.hidden.build import fit_hidden, require_hidden
-from dfsm.fitting.known import fitted_rows, known_coefficients
+from dfsm.fitting.known import fitted_rows, known_coefficients, wakes_of
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
+from dfsm.fitting.rough_inputs import inputs_told
 from dfsm.fitting.samples import Samples, extract, select
 from dfsm.fitting.schedule_gaps import schedule_gaps
 from dfsm.fitting.settings import FitSettings
@@ -51,6 +52,7 @@ from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Provenance
 from dfsm.models.stability import destabilised
+from dfsm.models.wakes import with_wakes
 from dfsm.numerics.time_mesh import mean_over, std_over
 from dfsm.refinement.refine import refine
 from dfsm.refinement.settings import RefineSettings
@@ -147,6 +149,9 @@ def fit(
     if settings.linear.margin is not None and (harm := destabilised(model)):
         model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     recorded = seen = samples
+    if wakes := wakes_of(settings.terms):
+        model = with_wakes(model, wakes, samples.inputs)
+        recorded = seen = with_latents(model, data, samples, settings)
     discarded: list[str] = []
     learned: list[str] = []
     if hidden is not None:
@@ -164,12 +169,12 @@ def fit(
             model = refined.model
             if refined.improved:
                 doubt = replace(doubt, notes=(), outdated=True)
+                learned = memory_doubt(model)
             else:
                 discarded.append(refined.message)
                 account = {"message": refined.message, "improved": False}
                 model = replace(model, provenance=Provenance({"refinement": account}))
             recorded = with_latents(model, data, samples, settings)
-            recorded = replace(recorded, terms=model.terms)
             seen = along_rollouts(model, data, recorded, settings)
     with _timed(seconds, "outputs"):
         g = _fit_outputs(seen, settings)
@@ -194,7 +199,7 @@ def fit(
     gaps = schedule_gaps(samples, f.model)
     known = (*f.warnings, *gaps, *(g.warnings if g else ()), *doubt.notes, *notes)
     notes = list(dict.fromkeys(known))
-    checks = [*_inputs_told(samples, settings), *f.notes, *learned, *checks]
+    checks = [*inputs_told(samples, settings), *f.notes, *learned, *checks]
     nonlinear = None
     if (
         settings.nonlinear_only
@@ -265,29 +270,6 @@ def _fit_slopes(rows: Samples, settings: FitSettings) -> Slopes:
     """The linear fit of ξ̇ alone, as a function of I."""
     model = _fit_derivatives(rows, settings).model
     return lambda inputs: predicted(model, replace(rows, inputs=inputs).linear_inputs)
-
-
-def _inputs_told(samples: Samples, settings: FitSettings) -> tuple[str, ...]:
-    """Which inputs were recognised as held, and what to set where they are not."""
-    names = samples.signals.driving
-    rough = tuple(
-        f"{name} turns at nearly every sample: taken for lines, interval by interval (if it does "
-        f"something else in between, set inputs: {{{name}: hold}} or cubic)"
-        for name in samples.rough
-    )
-    chosen = settings.inputs or {}
-    if isinstance(chosen, str):
-        return rough
-    kinds = zip(names, samples.signals.between, strict=True)
-    held = [name for name, kind in kinds if kind == "hold" and name not in chosen]
-    if not held:
-        return rough
-    which = ", ".join(held)
-    return (
-        *rough,
-        f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
-        f"samples (for lines set inputs: {{{held[0]}: linear}})",
-    )
 
 
 def _account(

@@ -13,6 +13,7 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.data.derivatives import kinematic_rows
+from dfsm.errors import DfsmError, near_matches
 from dfsm.fitting.corrective import CorrectiveFit, fit_corrective
 from dfsm.fitting.linear import LinearFit
 from dfsm.fitting.samples import Samples
@@ -91,10 +92,11 @@ def correct(
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     known = kinematic_rows(settings.states) if derivatives else {}
     mechanics = set(linear.model.complete()) - set(known)
+    names = _target_names(samples, derivatives)[: len(ratio)]
+    allowed = _allowed(samples, settings)
+    chosen = [i for i, (name, _) in enumerate(names) if allowed is None or name in allowed]
     large = [
-        i
-        for i in range(targets.shape[1])
-        if i not in known and i not in mechanics and ratio[i] > settings.gate
+        i for i in chosen if i not in known and i not in mechanics and ratio[i] > settings.gate
     ]
     hidden, trained = linear.model.hidden_among(samples.inputs.shape[1]), None
     if large and not later:
@@ -110,13 +112,15 @@ def correct(
     else:
         large = []
     decisions = []
-    for i, (name, unit) in enumerate(_target_names(samples, derivatives)[: len(ratio)]):
+    for i, (name, unit) in enumerate(names):
         if i in known:
             text = "kinematic, its rate is a state"
         elif i in mechanics:
             text = f"mechanics, residual {ratio[i]:.1%} of the signal"
         elif ratio[i] <= settings.gate:
             text = f"linear fit, residual {ratio[i]:.1%} of the signal (gate {settings.gate:.1%})"
+        elif i not in chosen:
+            text = f"linear fit, residual {ratio[i]:.1%} of the signal, not among 'corrected'"
         elif i in large:
             text = (
                 f"corrected, residual {ratio[i]:.1%} of the signal, of whose variance "
@@ -180,6 +184,18 @@ def predicted(model: LinearModel, inputs: Array) -> Array:
 @eqx.filter_jit
 def _apply(model: Any, inputs: Array) -> jax.Array:
     return jax.vmap(model)(jnp.asarray(inputs))
+
+
+def _allowed(samples: Samples, settings: FitSettings) -> tuple[str, ...] | None:
+    """Targets that may be corrected; each must be one."""
+    targets = [n for of in (True, False) for n, _ in _target_names(samples, of)]
+    for name in settings.corrected or ():
+        if name not in targets:
+            raise DfsmError(
+                f"corrected names '{name}', which is neither a derivative nor an output of the "
+                "model; " + near_matches(name, targets)
+            )
+    return settings.corrected
 
 
 def _target_names(samples: Samples, derivatives: bool) -> Sequence[tuple[str, str]]:

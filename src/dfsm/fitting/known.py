@@ -9,7 +9,7 @@ from dfsm.data.derivatives import kinematic_rows
 from dfsm.errors import DfsmError, near_matches
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
-from dfsm.models.terms import Rotor, RotorTerm
+from dfsm.models.terms import Rotor, RotorTerm, TermSettings
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,15 @@ def known_coefficients(
         if isinstance(s, Rotor) and s.memory == "wind" and s.speed in mechanics
     )
     return KnownCoefficients(fixed, first, balances)
+
+
+def wakes_of(terms: Sequence[TermSettings]) -> dict[int, str]:
+    """What the induced velocities of rotors that lag are called, by place of the term."""
+    return {
+        place: f"{rotor.name}.induced"
+        for place, rotor in enumerate(terms)
+        if isinstance(rotor, Rotor) and rotor.induction == "lag"
+    }
 
 
 def _row(rows: Mapping[str, int], state: str, key: str) -> int:

@@ -21,9 +21,9 @@ from dfsm.simulation.simulate import Status, simulate
 
 
 def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSettings) -> Samples:
-    """Add the latent states of a model to the inputs of recorded samples."""
+    """Add the latent states of a model to the inputs of recorded samples, and take its terms."""
     if not model.signals.latents:
-        return samples
+        return replace(samples, terms=model.terms)
     paths = []
     for run in data:
         inside = np.isin(run.time, run.window(known_from(run, settings), settings.stop).time)

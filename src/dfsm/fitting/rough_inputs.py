@@ -12,6 +12,7 @@ from dfsm.core.types import Array
 from dfsm.data.between import Roughness, roughness
 from dfsm.fitting.held_inputs import held_unseen
 from dfsm.fitting.samples import Samples
+from dfsm.fitting.settings import FitSettings
 from dfsm.numerics.time_mesh import std_over
 
 # An input matters that makes so much of a row, where so much of this is unexplained.
@@ -61,3 +62,26 @@ def _held(samples: Samples) -> list[int]:
     states = samples.inputs[:, samples.signals.observed_columns]
     driving = samples.inputs[:, samples.signals.order.driving_columns]
     return held_unseen(lambda: samples.blocks(states, driving))
+
+
+def inputs_told(samples: Samples, settings: FitSettings) -> tuple[str, ...]:
+    """Which inputs were recognised as held, and what to set where they are not."""
+    names = samples.signals.driving
+    rough = tuple(
+        f"{name} turns at nearly every sample: taken for lines, interval by interval (if it does "
+        f"something else in between, set inputs: {{{name}: hold}} or cubic)"
+        for name in samples.rough
+    )
+    chosen = settings.inputs or {}
+    if isinstance(chosen, str):
+        return rough
+    kinds = zip(names, samples.signals.between, strict=True)
+    held = [name for name, kind in kinds if kind == "hold" and name not in chosen]
+    if not held:
+        return rough
+    which = ", ".join(held)
+    return (
+        *rough,
+        f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
+        f"samples (for lines set inputs: {{{held[0]}: linear}})",
+    )

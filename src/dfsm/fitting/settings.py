@@ -48,6 +48,10 @@ class FitSettings:
     gate
         A row is corrected only where the RMS of its residual exceeds this share of the signal's
         standard deviation.
+    corrected
+        Names of the derivatives and outputs that may be corrected, as a summary names them; None
+        for all. A correction is as good as its data are near: what is flown far from them, with
+        other gains or along an optimum, is safer in the linear fit and its known terms.
     azimuth
         Blade-passing harmonics for the outputs.
     hub_height
@@ -83,6 +87,7 @@ class FitSettings:
     linear: LTI | LPV = field(default_factory=LTI)
     corrective: CorrectiveSettings = field(default_factory=MLP)
     gate: float = 0.01
+    corrected: tuple[str, ...] | None = None
     azimuth: Azimuth | None = None
     hub_height: float | None = None
     features: tuple[Feature, ...] = ()

@@ -22,6 +22,7 @@ from dfsm.models.linear import LinearModel
 from dfsm.models.passing import FACTORS, harmonics_of
 from dfsm.models.region import Region
 from dfsm.models.signals import SignalTable
+from dfsm.models.wakes import wake_columns
 
 _Shape = tuple[int, ...]
 
@@ -85,6 +86,7 @@ def check_model(model: DFSM) -> None:
         _shapes("terms", {"mean": (terms,), "std": (terms,)}, model.terms)
         made = jax.eval_shape(model.terms, jax.ShapeDtypeStruct((inputs,), jnp.float64))
         _equal("terms", made.shape, (terms,))
+    _equal("induced", wake_columns(model), [*range(inputs)[s.induced_columns]])
     harmonics = 2 if s.azimuth is not None and not s.azimuth.rings else 0
     _check_linear("f", model.f, states, inputs + terms, inputs)
     _check_corrective("e", model.e, (inputs, states), model.corrected)
@@ -112,6 +114,8 @@ def _check_signals(s: SignalTable) -> None:
         raise ValueError("latents, which are not the last states")
     if not set(s.telling) <= set(s.names("outputs")):
         raise ValueError("telling, of which some are no outputs")
+    if not 0 <= s.induced <= len(s.latents):
+        raise ValueError(f"induced, expected 0 to {len(s.latents)}")
     told_by_outputs = s.telling and not s.specs
     expected = [] if told_by_outputs else [*state_names(s.specs)]
     _equal("states", [c.name for c in s.observed], expected)

@@ -7,7 +7,8 @@ cannot: an inflow that settles, waves that went by. Nothing measured drives them
 tells their value at any time from its inputs alone, and they are stable whatever is learned.
 
 In a model they are the last states, with rows that do not depend on the schedule; everything that
-evaluates a model treats them like any other state.
+evaluates a model treats them like any other state. Induced velocities stand before them and follow
+the measured states, too: see `wakes`.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
-from dfsm.models.region import Region
 from dfsm.models.terms import Terms
 from dfsm.models.terms.form import Schedule
+from dfsm.models.wakes import settled_wakes
+from dfsm.models.wider import with_more_states, with_range
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 
 # Before the record begins, the inputs are taken to have been what they were on average over this.
@@ -91,7 +93,7 @@ def _with_poles(model: DFSM, dynamics: Poles) -> LinearModel:
 def _places(model: DFSM) -> tuple[slice, int, IntArray, IntArray]:
     """Columns that drive the pairs, the states' first, and rows of real and imaginary parts."""
     s = model.signals
-    rows = np.arange(len(s.observed), len(s.states))
+    rows = np.arange(s.marched, len(s.states))
     return s.order.driving_columns, s.state_columns.start, rows[::2], rows[1::2]
 
 
@@ -155,11 +157,11 @@ def at_rest(model: DFSM, inputs: jax.Array) -> jax.Array:
     dynamics = poles(model)
     force = inputs[..., s.order.driving_columns] @ dynamics.drive.T + dynamics.offset
     pairs = as_states(force / (dynamics.decay + 1j * dynamics.frequency))
-    return inputs.at[..., s.latent_columns].set(pairs)
+    return settled_wakes(model, inputs.at[..., s.pair_columns].set(pairs))
 
 
 def latent_path(model: DFSM, run: Trajectory) -> Array:
-    """Latent states along the recorded inputs of a run.
+    """Latent pairs along the recorded inputs of a run, as states.
 
     Parameters
     ----------
@@ -171,14 +173,14 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     Returns
     -------
     ndarray
-        Shape ``(time, latent)``.
+        Shape ``(time, 2 pair)``.
 
     Raises
     ------
     DfsmError
         A channel is missing or not finite.
     """
-    if not model.signals.latents:
+    if not model.signals.pairs:
         return np.zeros((len(run), 0))
     inputs = run.select(model.signals.driving).require_finite()
     padded = -(-(len(run) - 1) // _PAD) * _PAD
@@ -199,7 +201,7 @@ def _held(model: DFSM) -> NDArray[np.bool_]:
 
 
 def latents_at(model: DFSM, run: Trajectory, time: Array) -> Array:
-    """Latent states at times in s within a run, ``(time, latent)``; see `latent_path`."""
+    """Latent pairs at times in s within a run, ``(time, 2 pair)``; see `latent_path`."""
     time = np.clip(time, run.time[0], run.time[-1])
     both = np.union1d(run.time, time)
     inputs = run.select(model.signals.driving)
@@ -212,11 +214,11 @@ def latents_at(model: DFSM, run: Trajectory, time: Array) -> Array:
 
 
 def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
-    """Latent states at a time in s, shape ``(latent,)``, from the inputs recorded up to it.
+    """Latent pairs at a time in s, shape ``(2 pair,)``, from the inputs recorded up to it.
 
     Where the record begins there, they are at rest. The arguments are those of `latent_path`.
     """
-    if not model.signals.latents:
+    if not model.signals.pairs:
         return np.empty(0)
     now = max(2, int(np.searchsorted(run.time, start, side="right")))
     past = run.select(model.signals.driving)
@@ -248,7 +250,7 @@ def add_latents(
     Parameters
     ----------
     model
-        Has none.
+        Has none but perhaps induced velocities.
     dynamics
         Their dynamics.
     coupling
@@ -261,86 +263,30 @@ def add_latents(
         ``(2 pair,)``.
     """
     s, count = model.signals, coupling.shape[1]
-    at, n = s.state_columns.stop, len(s.states)
-
-    def wider(linear: LinearModel, extra_rows: int) -> LinearModel:
-        L = np.insert(np.asarray(linear.coefficients), np.full(count, at), 0.0, axis=2)
-        L = np.pad(L, ((0, 0), (0, extra_rows), (0, 0)))
-        b = np.pad(np.asarray(linear.offsets), ((0, 0), (0, extra_rows)))
-        if extra_rows:
-            L[:, :n, at : at + count] = coupling
-        known = [(row, c + count if c >= at else c) for row, c in linear.known]
-        if extra_rows:
-            # They reach a balance of known torques through its term.
-            known += [(row, c) for row in model.balances for c in range(at, at + count)]
-        schedule = linear.schedule
-        return replace(
-            linear,
-            schedule=schedule + count if schedule is not None and schedule >= at else schedule,
-            coefficients=from_host(L),
-            offsets=from_host(b),
-            known=tuple(sorted(known)),
-        )
-
-    f = wider(model.f, count)
+    at = s.state_columns.stop
     names = tuple(Channel(f"latent{k + 1}", "-") for k in range(count))
-    wide = DFSM(
-        f=f,
-        e=None if model.e is None else model.e.with_more_inputs(at, count),
-        g=None if model.g is None else wider(model.g, 0),
-        e_g=None if model.e_g is None else model.e_g.with_more_inputs(at, count),
-        region=_with_range(model.region, slice(at, at), paths),
-        corrected=model.corrected,
-        corrected_outputs=model.corrected_outputs,
-        signals=replace(s, states=(*s.states, *names), latents=names),
-        provenance=model.provenance,
-        terms=_terms(model, at, names, gains or {}),
-    )
+    wide = with_more_states(model, names, coupling, paths)
+    # They reach a balance of known torques through its term.
+    known = {(row, c) for row in model.balances for c in range(at, at + count)}
+    f = replace(wide.f, known=tuple(sorted({*wide.f.known, *known})))
+    wide = replace(wide, f=f, terms=_reached(wide, at, names, gains or {}))
     return with_poles(wide, dynamics)
 
 
-def _terms(
-    model: DFSM, at: int, names: Sequence[Channel], gains: Mapping[int, Array]
+def _reached(
+    wide: DFSM, at: int, names: Sequence[Channel], gains: Mapping[int, Array]
 ) -> Terms | None:
-    if model.terms is None:
+    """The terms, some of which latent states reach."""
+    if wide.terms is None:
         return None
-    wide, column = model.terms.with_more_inputs(at, len(names)), model.f.schedule
-    if column is not None and column >= at:
-        column += len(names)
-    schedule, parts = Schedule(column, np.asarray(model.f.grid)), list(wide.parts)
+    schedule, parts = Schedule(wide.f.schedule, np.asarray(wide.f.grid)), list(wide.terms.parts)
     for place, weights in gains.items():
         parts[place] = parts[place].with_latents([c.name for c in names], at, weights, schedule)
-    return replace(wide, parts=tuple(parts))
+    return replace(wide.terms, parts=tuple(parts))
 
 
 def with_latent_range(model: DFSM, paths: Sequence[Array]) -> DFSM:
     """The model with the training range of its latent states taken from their paths."""
     s = model.signals
-    region = _with_range(model.region, s.latent_columns, paths)
+    region = with_range(model.region, s.latent_columns, paths)
     return replace(model, region=replace(region, operating=at_rest(model, region.operating)))
-
-
-def with_columns(region: Region, at: int, values: Array) -> Region:
-    """The region of more inputs, from column `at` on, of which there are samples ``(time, n)``."""
-    return _with_range(region, slice(at, at), [values])
-
-
-def _with_range(region: Region, gone: slice, paths: Sequence[Array]) -> Region:
-    """Ranges and moments of the inputs with those of some columns replaced."""
-    z, W = np.concatenate(paths), region.whitening
-    place = np.full(z.shape[1], gone.start)
-
-    def put(values: jax.Array, new: Array) -> jax.Array:
-        kept = np.delete(np.asarray(values), gone, axis=-1)
-        return from_host(np.insert(kept, place, new, axis=-1))
-
-    return replace(
-        region,
-        low=put(region.low, z.min(axis=0)),
-        high=put(region.high, z.max(axis=0)),
-        mean=put(region.mean, z.mean(axis=0)),
-        std=put(region.std, z.std(axis=0)),
-        operating=put(region.operating, np.tile(z.mean(axis=0), (len(region.grid), 1))),
-        # Latent states follow from what was counted already: they add no distance.
-        whitening=put(W, np.zeros(len(place))) if W.size else W,
-    )

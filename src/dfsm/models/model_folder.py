@@ -238,7 +238,7 @@ def _put_together(
         raise ValueError(f"latents, which are {len(signals.latents)} in its signals")
     if not latents:
         # The nonlinear-only model beside a refined one has none.
-        signals = replace(signals, states=signals.observed, latents=())
+        signals = replace(signals, states=signals.observed, latents=(), induced=0)
     return DFSM(
         f=f,
         e=corrective("e"),

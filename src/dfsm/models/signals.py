@@ -120,6 +120,9 @@ class SignalTable:
         One `Channel` per element of ξ, u, w, p and y.
     latents
         The last of the states: those that no channel holds, see `latents.py`.
+    induced
+        How many of these, the first, follow the other states, too: the induced velocities of
+        rotors, see `wakes.py`.
     field
         Harmonics of the wind field, which drive ĝ alone; see `Azimuth`.
     between
@@ -161,6 +164,7 @@ class SignalTable:
     startup: float = 0.0
     telling: tuple[str, ...] = ()
     step: float | None = None
+    induced: int = 0
 
     @property
     def inputs(self) -> tuple[Channel, ...]:
@@ -203,6 +207,27 @@ class SignalTable:
         """Where the latent states stand in I."""
         last = self.state_columns.stop
         return slice(last - len(self.latents), last)
+
+    @property
+    def induced_columns(self) -> slice:
+        """Where the induced velocities stand in I."""
+        first = self.latent_columns.start
+        return slice(first, first + self.induced)
+
+    @property
+    def pair_columns(self) -> slice:
+        """Where `pairs` stand in I."""
+        return slice(self.induced_columns.stop, self.latent_columns.stop)
+
+    @property
+    def pairs(self) -> tuple[Channel, ...]:
+        """Latent states that follow from controls and disturbances alone, see `latents.py`."""
+        return self.states[self.marched :]
+
+    @property
+    def marched(self) -> int:
+        """How many states, the first, depend on each other: all but `pairs`."""
+        return len(self.observed) + self.induced
 
     @property
     def exogenous(self) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ class Parametrization(eqx.Module):
         varies = np.ptp(L, axis=0).any(axis=0) | (len(L) == 1)
         varies[list(model.f.known_among(len(varies)))] = False
         # Nothing is known yet about states that have only been added.
-        varies[s.latent_columns] = True
+        varies[s.pair_columns] = True
         scheduled, constant = (tuple(np.flatnonzero(v).tolist()) for v in (varies, ~varies))
         free = tuple(tuple((i, c) not in model.f.known for c in constant) for i in rows)
         typical = np.maximum(spread[list(rows)], np.finfo(float).tiny)
@@ -92,7 +92,7 @@ class Parametrization(eqx.Module):
     @property
     def _shapes(self) -> list[tuple[int, ...]]:
         points, rows = len(self.model.f.grid), len(self.rows)
-        pairs = len(self.model.signals.latents) // 2
+        pairs = len(self.model.signals.pairs) // 2
         return [
             (points, rows, len(self.scheduled) + 1),
             (rows, len(self.constant)),
@@ -126,14 +126,14 @@ class Parametrization(eqx.Module):
         scheduled, constant, dynamics, drive, *others = self._parts(deviations)
         terms, corrective = self._divided(others)
         f, e = self._linear(scheduled, constant), self._corrective(corrective)
-        if self.model.signals.latents:
+        if self.model.signals.pairs:
             f = self._latents(replace(self.model, f=f), dynamics, drive).f
         return f, e, self._terms(terms)
 
     def slopes(
         self, deviations: jax.Array, model: DFSM, inputs: jax.Array, weights: jax.Array
     ) -> jax.Array:
-        """Σ_i W_i ∂f̂/∂θ(I_i) of the observed states, but for the dynamics of latent pairs.
+        """Σ_i W_i ∂f̂/∂θ(I_i) of the states that are marched, but for the dynamics of latent pairs.
 
         Written out because it is what refinement spends its time on; tracing `at` backwards gives
         the same several times slower.
@@ -147,14 +147,14 @@ class Parametrization(eqx.Module):
         inputs
             I, shape ``(step, i, input)``.
         weights
-            W, shape ``(step, i, observed state, observed state)``.
+            W, shape ``(step, i, state, state)`` of those.
 
         Returns
         -------
         Array
-            Shape ``(step, observed state, parameter)``; zero for the latent pairs' own.
+            Shape ``(step, state, parameter)``; zero for the latent pairs' own.
         """
-        steps, stages, observed = weights.shape[:3]
+        steps, stages, states = weights.shape[:3]
         z = jax.vmap(jax.vmap(partial(self._wide, model)))(inputs)
         hats = jax.vmap(jax.vmap(model.f.shares))(inputs)
         by_row = weights[..., list(self.rows)] * self.spread
@@ -171,8 +171,8 @@ class Parametrization(eqx.Module):
         )
         always = sum(by_row[:, i, ..., None] * constant[:, i, None, None] for i in range(stages))
         parts = [scheduled, always * self._free]
-        parts = [jnp.reshape(p, (steps, observed, -1)) for p in parts]
-        parts.append(jnp.zeros((steps, observed, self.latent_columns.size)))
+        parts = [jnp.reshape(p, (steps, states, -1)) for p in parts]
+        parts.append(jnp.zeros((steps, states, self.latent_columns.size)))
         if self._term_shapes:
             by_term = self._term_slopes(deviations, model, inputs)
             parts += [jnp.einsum("tiar,tirp->tap", weights, by_term)]
@@ -183,10 +183,10 @@ class Parametrization(eqx.Module):
         return jnp.concatenate(parts, axis=2)
 
     def _term_slopes(self, deviations: jax.Array, model: DFSM, inputs: jax.Array) -> jax.Array:
-        """∂(L_φ φ)/∂θ, shape ``(step, i, observed state, parameter of terms)``."""
+        """∂(L_φ φ)/∂θ, shape ``(step, i, state, parameter of terms)``."""
         terms, _ = self._divided(self._parts(deviations)[4:])
         # Those of rows that are known, too: what a term takes may be learnt.
-        first, observed = len(model.signals.inputs), len(model.signals.observed)
+        first, states = len(model.signals.inputs), model.signals.marched
 
         def at_one(inputs: jax.Array) -> jax.Array:
             def values(parts: list[jax.Array]) -> jax.Array:
@@ -197,7 +197,7 @@ class Parametrization(eqx.Module):
             by_part = jax.jacrev(values)(terms)
             J = jnp.concatenate([p.reshape(p.shape[0], -1) for p in by_part], axis=1)
             L, _ = model.f.at(inputs[model.f.schedule or 0])
-            return L[:observed, first:] @ J
+            return L[:states, first:] @ J
 
         return jax.vmap(jax.vmap(at_one))(inputs)
 
@@ -224,7 +224,7 @@ class Parametrization(eqx.Module):
         """
         s, now, start = self.model.signals, poles(model), poles(self.model)
         z = self._standardised(inputs)
-        latent = inputs[s.latent_columns].reshape(-1, 2)
+        latent = inputs[s.pair_columns].reshape(-1, 2)
         turned = jnp.stack([latent[:, 1], -latent[:, 0]], axis=1)
         moved = jnp.concatenate([z[np.array(self.driven, dtype=int)], jnp.ones(1)])
         drive = jnp.hypot(start.decay, start.frequency)[:, None] * moved

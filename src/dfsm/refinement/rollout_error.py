@@ -32,6 +32,7 @@ from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, as_states, evolve, poles, rest
 from dfsm.models.recorded import recorded_states
+from dfsm.models.wakes import wakes_along
 from dfsm.numerics.filters import moving_average
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
@@ -90,8 +91,10 @@ class Record:
 
     def latent_states(self, model: DFSM) -> Array:
         """A model's latent states from the first state on, ``(step + 1, latent)``."""
-        pairs = self.follow(poles(model))[self.before :]
-        return np.asarray(as_states(from_host(pairs)))
+        pairs = np.asarray(as_states(from_host(self.follow(poles(model))[self.before :])))
+        seen = from_host(self.states), from_host(self.inputs[2 * self.before :: 2])
+        wakes = wakes_along(model, self.step, *seen, from_host(pairs))
+        return np.concatenate([wakes, pairs], axis=1)
 
     def inputs_at(self, model: DFSM) -> Array:
         """I along the record, ``(step + 1, input)``."""
@@ -187,6 +190,9 @@ class _Windows(NamedTuple):
         Controls and disturbances of the whole record at the ends of steps, and before it.
     held, record_ends
         As `Record.held`, and what `Record.driving` says of the record.
+    before, along
+        Steps of the record before its first state, and from there on the states ``(time, state)``
+        and the exogenous inputs; None for a model without induced velocities.
     """
 
     step: float
@@ -197,9 +203,11 @@ class _Windows(NamedTuple):
     rest: Array
     held: NDArray[np.bool_] | None
     record_ends: Array | None
+    before: int
+    along: tuple[Array, Array] | None
 
 
-def _windows(record: Record, length: float | None) -> _Windows:
+def _windows(record: Record, length: float | None, *, wakes: bool) -> _Windows:
     steps = len(record.states) - 1
     each = steps if length is None else min(steps, round(length / record.step))
     first = np.arange(0, steps - each + 1, each)
@@ -214,6 +222,8 @@ def _windows(record: Record, length: float | None) -> _Windows:
         record.rest,
         record.held,
         ends,
+        record.before,
+        (record.states, record.inputs[2 * record.before :: 2]) if wakes else None,
     )
 
 
@@ -269,7 +279,8 @@ class RolloutError:
         kept: StabilityKept | None = None,
     ) -> None:
         self._parameters, self._counts, self._kept = parameters, counts, kept
-        self._groups = [tuple(_windows(r, length) for r in group) for group in groups]
+        wakes = parameters.model.signals.induced > 0
+        self._groups = [tuple(_windows(r, length, wakes=wakes) for r in group) for group in groups]
         overall = np.concatenate([r.states for group in groups for r in group]).std(axis=0)
         self._scales = []
         for group in groups:
@@ -368,7 +379,7 @@ def _slopes(
 ) -> tuple[jax.Array, jax.Array]:
     """Rows of J that stand for all over the windows of one run, and Jᵀ times errors."""
     starts = _starts(parameters.at(w), windows)
-    slopes = _start_slopes(parameters, w, windows)
+    slopes = _start_slopes(parameters, w, windows), _wake_slopes(parameters, w, windows)
     steps = errors.shape[1]
     every = max(1, min(_EVERY, steps // _FEWEST))
     follow = partial(sensitivities, parameters, w, windows.step, every=every)
@@ -396,13 +407,32 @@ def _start_slopes(parameters: Parametrization, w: jax.Array, windows: _Windows) 
     return jax.jacfwd(starts)(jnp.zeros(own))
 
 
+def _wake_slopes(parameters: Parametrization, w: jax.Array, windows: _Windows) -> jax.Array:
+    """Slopes of the marched states at the starts, ``(window, state, parameter)``.
+
+    Those that are measured have none.
+    """
+    s = parameters.model.signals
+    observed = len(s.observed)
+
+    def wakes(w: jax.Array) -> jax.Array:
+        return _starts(parameters.at(w), windows)[:, observed : s.marched]
+
+    none = jnp.zeros((len(windows.first), observed, w.size))
+    return jnp.concatenate([none, jax.jacrev(wakes)(w)], axis=1) if s.induced else none
+
+
 def _starts(model: DFSM, windows: _Windows) -> jax.Array:
     """States at the start of every window; latent ones follow from the inputs before it."""
-    measured = jnp.asarray(windows.states[:, 0])
+    measured, first = jnp.asarray(windows.states[:, 0]), windows.first
     if not model.signals.latents:
         return measured
     record = jnp.asarray(windows.record)
     h = jnp.full(len(record) - 1, windows.step)
     ends = None if windows.record_ends is None else jnp.asarray(windows.record_ends)
     path = as_states(evolve(poles(model), h, record, jnp.asarray(windows.rest), ends))
-    return jnp.concatenate([measured, path[windows.first]], axis=1)
+    if windows.along is None:
+        return jnp.concatenate([measured, path[first]], axis=1)
+    before, (states, inputs) = windows.before, map(jnp.asarray, windows.along)
+    wakes = wakes_along(model, windows.step, states, inputs, path[before:])
+    return jnp.concatenate([measured, wakes[first - before], path[first]], axis=1)

@@ -22,7 +22,8 @@ class RefineSettings:
     latents
         Number of latent states to add to a model that has none, an even number, see `latents.py`.
     latent_inputs
-        Controls and disturbances that drive them; None takes all.
+        Controls and disturbances that drive them; None takes all. Where a controller chose the
+        controls and other gains or an optimum are asked for, disturbances alone should.
     network
         Hidden units of a tanh network to add to a derivative function that is not corrected; what
         derivatives do not show, rollouts may. `fit` then corrects outputs only.

@@ -61,7 +61,7 @@ def sensitivities(
     w: jax.Array,
     step: float,
     x0: jax.Array,
-    pairs0: jax.Array,
+    slopes0: tuple[jax.Array, jax.Array],
     drive: Stages,
     errors: jax.Array,
     every: int,
@@ -80,8 +80,9 @@ def sensitivities(
         In s.
     x0
         States at the start, shape ``(state,)``.
-    pairs0
-        Slopes of the latent pairs there, shape ``(pair, 2, own)``.
+    slopes0
+        Slopes there of the latent pairs, ``(pair, 2, own)``, and of the states that are marched,
+        ``(marched state, parameter)``.
     drive
         Exogenous inputs along the steps, see `integrate.stages`.
     errors
@@ -96,7 +97,7 @@ def sensitivities(
         ``(parameter,)``.
     """
     model = parameters.at(w)
-    path = _path(parameters, model, step, x0, pairs0, drive)
+    path = _path(parameters, model, step, x0, slopes0[0], drive)
     observed, steps = len(model.signals.observed), len(path.states)
 
     def along(
@@ -105,7 +106,8 @@ def sensitivities(
         S, total = at
         part, e, keep = block
         S, each = jax.lax.scan(_advance, S, _transitions(parameters, w, model, step, part))
-        return (S, total + jnp.einsum("tap,ta->p", each, e)), each[keep]
+        seen = each[:, :observed]
+        return (S, total + jnp.einsum("tap,ta->p", seen, e)), seen[keep]
 
     # Blocks stay in the cache; beyond the end the last step is repeated, and does not count.
     size = -(-min(_BLOCK, steps) // every) * every
@@ -119,7 +121,7 @@ def sensitivities(
     keep = np.zeros(count * size // every, dtype=int)
     keep[: len(kept)] = kept % size
     along_path = jax.tree.map(partial(blocks, mode="edge"), path)
-    start = jnp.zeros((observed, w.size)), jnp.zeros(w.size)
+    start = slopes0[1], jnp.zeros(w.size)
     each = along_path, blocks(errors, "constant"), jnp.asarray(keep).reshape(count, -1)
     (_, total), S = jax.lax.scan(along, start, each)
     return S.reshape(-1, observed, w.size)[: len(kept)], total
@@ -147,20 +149,20 @@ def _transitions(
     Returns
     -------
     tuple of Array
-        Shapes ``(step, observed state, observed state)`` and ``(step, observed state, parameter)``.
+        Shapes ``(step, marched state, marched state)`` and ``(step, marched state, parameter)``.
     """
-    observed, columns = len(model.signals.observed), parameters.latent_columns
+    marched, columns = model.signals.marched, parameters.latent_columns
     A = jax.vmap(jax.vmap(partial(_state_matrix, model.prepared())))(path.inputs)
-    own = A[..., :observed]
-    free = path.free[:, :observed]
+    own = A[..., :marched]
+    free = path.free[:, :marched]
     weights = _stage_weights(own, step) * free[:, None, :, None]
     through = jnp.einsum("tiab,tibc->tac", weights, own)
     grown = parameters.slopes(w, model, path.inputs, weights)
     if columns.size:
-        coupling = A[..., observed:].reshape(*A.shape[:3], -1, 2)
+        coupling = A[..., marched:].reshape(*A.shape[:3], -1, 2)
         by_pair = jnp.einsum("tiab,tibkc,tikcq->takq", weights, coupling, path.pairs)
         grown = grown.at[..., columns].add(by_pair)
-    return free[..., None] * jnp.eye(observed) + through, grown
+    return free[..., None] * jnp.eye(marched) + through, grown
 
 
 class _Path(NamedTuple):
@@ -195,7 +197,7 @@ def _path(
     """March states and latent slopes; arguments as for `sensitivities`, `plain` is the model."""
     model, dynamics = plain.prepared(), poles(plain)
     low, high = clip_range(model, FAR)
-    observed = len(plain.signals.observed)
+    marched = plain.signals.marched
     M = jnp.stack([-dynamics.decay, dynamics.frequency, -dynamics.frequency, -dynamics.decay])
     M = M.T.reshape(-1, 2, 2)
 
@@ -211,7 +213,7 @@ def _path(
         (x, P), stages = rk4_step(slope, at, step, drive)
         held = jnp.clip(x, low, high)
         free = jnp.where(held == x, 1.0, 0.0)
-        P = P * free[observed:].reshape(-1, 2)[..., None]
+        P = P * free[marched:].reshape(-1, 2)[..., None]
         v0, vm, v1 = drive
         seen = [inputs(x, v) for (x, _), v in zip(stages, (v0, vm, vm, v1), strict=True)]
         pairs = jnp.stack([pair for _, pair in stages])
@@ -221,10 +223,10 @@ def _path(
 
 
 def _state_matrix(model: DFSM, inputs: jax.Array) -> jax.Array:
-    """∂f̂/∂ξ of the observed states at one input vector, ``(observed state, state)``."""
+    """∂f̂/∂ξ of the marched states at one input vector, ``(marched state, state)``."""
     x, *others = model.split(inputs)
-    observed = len(model.signals.observed)
-    return jax.jacrev(lambda x: model.derivative(x, *others)[:observed])(x)
+    marched = model.signals.marched
+    return jax.jacrev(lambda x: model.derivative(x, *others)[:marched])(x)
 
 
 def _stage_weights(A: jax.Array, h: float) -> jax.Array:

@@ -39,7 +39,7 @@ def start_latents(
     Parameters
     ----------
     model
-        Has none.
+        Has none but perhaps induced velocities.
     records
         Training runs.
     count
@@ -143,6 +143,7 @@ def _through_terms(model: DFSM, records: Sequence[Record], coupling: Array) -> d
     if model.terms is None:
         return {}
     first, inputs = len(model.signals.inputs), model.signals.state_columns.start
+    wakes = range(len(model.signals.observed), model.signals.marched)
     at = np.concatenate([r.inputs_at(model) for r in records])
     slopes = model.terms.slopes(at).mean(axis=0)
     L, gains, value = np.asarray(model.f.coefficients).mean(axis=0), {}, first
@@ -156,7 +157,7 @@ def _through_terms(model: DFSM, records: Sequence[Record], coupling: Array) -> d
         effect = effect[:, term.columns[0]]
         gains[place] = coupling[row] / effect[row]
         coupling -= np.outer(effect, gains[place])
-        coupling[row] = 0.0
+        coupling[[row, *wakes]] = 0.0
     return gains
 
 

@@ -60,7 +60,7 @@ class Course:
         runs = [record for group in records for record in group]
         spread = _spread(runs)
         started, settings = self.model, self.settings
-        if settings.latents and not started.signals.latents:
+        if settings.latents and not started.signals.pairs:
             drivers = _drivers(started, settings)
             started = start_latents(started, runs, settings.latents, spread, drivers)
         if settings.network and started.e is None:

@@ -24,7 +24,9 @@ from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.inputs import GROUPS
 from dfsm.models.latents import latent_path, latent_state
+from dfsm.models.recorded import recorded_states
 from dfsm.models.terms.sensor import Sensor, SensorTerm
+from dfsm.models.wakes import settled_wakes, wakes_along
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 from dfsm.simulation.integrate import Stages, mesh_of, rk4, stages_of
 
@@ -46,21 +48,49 @@ def _stages(drive: _Drive) -> Stages:
     return jnp.asarray(begin), jnp.asarray(middle), jnp.asarray(end)
 
 
-def latents_from_past(model: DFSM, run: Trajectory, start: float) -> Array:
-    """Latent states at a time in s, ``(latent,)``, of what was recorded up to it."""
+def pairs_from_past(model: DFSM, run: Trajectory, start: float) -> Array:
+    """Latent states at a time in s, but for induced velocities, of what was recorded up to it."""
     if not model.signals.startup:
         return latent_state(model, run, start)
     return told_state(model, run, start)[len(model.signals.observed) :]
 
 
+def latents_from_past(model: DFSM, run: Trajectory, start: float, observed: Array) -> Array:
+    """Latent states at a time in s, ``(latent,)``, of what was recorded up to it.
+
+    Induced velocities are those that `observed`, the other states ``(state,)``, lead to.
+    """
+    s, pairs = model.signals, pairs_from_past(model, run, start)
+    if not s.induced:
+        return pairs
+    now = max(0, int(np.searchsorted(run.time, start, side="right")) - 1)
+    exogenous = s.order.split_exogenous(jnp.asarray([run[n][now] for n in s.exogenous]))
+    states = np.concatenate([observed, np.zeros(s.induced), pairs])
+    inputs = settled_wakes(model, model.join(states, *exogenous))
+    return np.asarray(inputs[s.latent_columns])
+
+
 def latents_along(model: DFSM, run: Trajectory) -> Array:
     """Latent states along a record, ``(time, latent)``: those of a rollout, for hidden ones."""
-    if not model.signals.startup:
-        return latent_path(model, run)
-    run = completed(run, model.signals)
+    s = model.signals
+    if not s.startup:
+        pairs = latent_path(model, run)
+        return np.concatenate([_wakes_along(model, run, pairs), pairs], axis=1)
+    run = completed(run, s)
     start = told_state(model, run, float(run.time[0]))
     states = _Past.of(model, run, measured=False).rollout(model, start)
     return states[:, len(model.signals.observed) :]
+
+
+def _wakes_along(model: DFSM, run: Trajectory, pairs: Array) -> Array:
+    """Induced velocities along a record, ``(time, induced velocity)``."""
+    s = model.signals
+    if not s.induced:
+        return np.zeros((len(run), 0))
+    states = recorded_states(model, run).at(run.time)
+    seen = (states, run.select(s.exogenous).values, pairs)
+    steps = jnp.asarray(np.diff(run.time))
+    return np.asarray(wakes_along(model, steps, *map(jnp.asarray, seen)))
 
 
 def told_state(model: DFSM, run: Trajectory, start: float) -> Array:

@@ -177,7 +177,7 @@ def simulate(
         tell = told_state if model.signals.startup else _observed_state
         x0 = tell(model, batch[i], begins) if starts is None else starts[i]
         if len(x0) < len(model.signals.states):
-            x0 = np.concatenate([x0, latents_from_past(model, batch[i], begins)])
+            x0 = np.concatenate([x0, latents_from_past(model, batch[i], begins, x0)])
         turned = (fields[i] if fields else driven[i].select(())).values
         return Case(drive, x0, initial_azimuth(model, batch[i], begins), turned)
 
@@ -269,7 +269,8 @@ def initial_state(model: DFSM, run: Trajectory, start: float, *, complete: bool 
     run = completed(run, model.signals) if complete else run
     if model.signals.startup:
         return told_state(model, run, start)
-    return np.append(_observed_state(model, run, start), latents_from_past(model, run, start))
+    observed = _observed_state(model, run, start)
+    return np.concatenate([observed, latents_from_past(model, run, start, observed)])
 
 
 def _starts(model: DFSM, initial: ArrayLike, runs: int) -> Array:

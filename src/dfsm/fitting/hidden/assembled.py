@@ -14,9 +14,9 @@ from dfsm.fitting.hidden.form import Form
 from dfsm.fitting.hidden.search import Found
 from dfsm.models.corrective import Corrective, Perceptron, Polynomial
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import with_columns
 from dfsm.models.linear import LinearModel
 from dfsm.models.terms import SensorTerm, Terms
+from dfsm.models.wider import with_columns
 
 
 def assembled(model: DFSM, found: Found, startup: float) -> DFSM:

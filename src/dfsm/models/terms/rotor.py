@@ -67,6 +67,11 @@ class Rotor:
     uncertainty
         Share by which the table's thrust and torque may well be off: with one above 0 refinement
         learns smooth factors of both, quadratic in blade pitch and inflow.
+    induction
+        ``"steady"``: the table holds at every moment. ``"lag"``: what the wake has settled to is a
+        hidden state ``<name>.induced`` in m/s, which follows momentum theory with a lag, and the
+        table is read at the wind that has the blades' present inflow; see `terms.induction`. A
+        steady state has the table's forces. Refinement learns the lag within a factor of four.
     name
         What the values are called: ``<name>.thrust`` in kN and ``<name>.torque`` in kN-m.
     """
@@ -87,6 +92,7 @@ class Rotor:
     efficiency: float = 1.0
     memory: Literal["speed", "wind"] = "speed"
     uncertainty: float = 0.0
+    induction: Literal["steady", "lag"] = "steady"
     name: str = "rotor"
     kind: Literal["rotor"] = "rotor"
 
@@ -204,6 +210,8 @@ class Rotor:
             late=from_host(np.zeros((1, 1))),
             grid_of_late=from_host(np.zeros(1)),
             trim=from_host(np.zeros((2, 6))),
+            induction=from_host(np.zeros((2, 0, 0))),
+            pace=from_host(np.zeros(2)),
             grid=grid,
             about=about,
         )

@@ -71,12 +71,20 @@ class Grid:
 def surface_values(
     weights: jax.Array, grid: Grid, wind: jax.Array, tip_speed: jax.Array, pitch: jax.Array
 ) -> jax.Array:
-    """(κ² v² + u²) (C_T, C_Q), shape ``(2,)``, in m²/s².
+    """(κ² v² + u²) (C_T, C_Q), shape ``(2,)``, in m²/s²; see `surface`."""
+    value = surface(weights, grid, wind, tip_speed, pitch)
+    return value * ((grid.stretch * wind) ** 2 + tip_speed**2)
+
+
+def surface(
+    weights: jax.Array, grid: Grid, wind: jax.Array, tip_speed: jax.Array, pitch: jax.Array
+) -> jax.Array:
+    """Splines over the inflow's angle and the blades' pitch, shape ``(2,)``.
 
     Parameters
     ----------
     weights
-        Of the splines, shape ``(2, cell + 3, pitch cell + 3)``.
+        Of two splines, shape ``(2, cell + 3, pitch cell + 3)``.
     grid
         Where they lie.
     wind, tip_speed
@@ -90,8 +98,7 @@ def surface_values(
     j, across = _basis((pitch - grid.pitch_start) / grid.pitch_step, weights.shape[2] - 3)
     patch = jax.lax.dynamic_slice(weights, (jnp.int32(0), i, j), (2, 4, 4))
     # Sums of products instead of small matrix products, which cost a call each.
-    value = jnp.sum(patch * (along[:, None] * across), axis=(1, 2))
-    return value * (w**2 + tip_speed**2)
+    return jnp.sum(patch * (along[:, None] * across), axis=(1, 2))
 
 
 def _basis(at: jax.Array, cells: int) -> tuple[jax.Array, jax.Array]:
@@ -132,7 +139,7 @@ def make_surface(table: RotorTable) -> tuple[Array, Grid, float]:
                 for k, c in enumerate((table.ct, table.cq))
             ]
         )
-        weights = _padded(_interpolating(_interpolating(values, axis=1), axis=2))
+        weights = _padded(interpolating(interpolating(values, axis=1), axis=2))
         error = _error(table, weights, grid)
         if error <= TOLERANCE:
             break
@@ -212,7 +219,15 @@ def _fast(
     return forward + behind * np.where(still > 0, still, still / (1 + (behind / end) ** 2))
 
 
-def _interpolating(values: Array, axis: int) -> Array:
+def at_knots(weights: Array) -> Array:
+    """Values of a spline at its knots, two less along each axis than `weights`."""
+    for axis in (0, 1):
+        w = np.moveaxis(weights, axis, 0)
+        weights = np.moveaxis((w[:-2] + 4 * w[1:-1] + w[2:]) / 6, 0, axis)
+    return weights
+
+
+def interpolating(values: Array, axis: int) -> Array:
     """Weights of the cubic B-splines through values on a uniform grid, two more than those.
 
     The third derivative is continuous across the first and the last knot inside, so that cubics

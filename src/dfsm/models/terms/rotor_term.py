@@ -15,6 +15,7 @@ from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
 from dfsm.models.terms.form import Schedule, Term
+from dfsm.models.terms.induction import lag, make_induction, settled, wind_of_inflow
 from dfsm.models.terms.rotor_check import check_signals
 from dfsm.models.terms.rotor_surface import TOLERANCE, Grid, surface_values
 from dfsm.numerics.hats import hats
@@ -51,6 +52,8 @@ class RotorConstants:
         Of the signals.
     error
         Of the splines against the table, see `make_surface`.
+    lags
+        Whether the induced velocity is a state, whose rate is the third value; see `induction`.
     """
 
     inputs: tuple[str, ...]
@@ -71,6 +74,7 @@ class RotorConstants:
     speed_unit: str
     pitch_unit: str
     error: float
+    lags: bool = False
 
 
 class RotorTerm(Term):
@@ -93,6 +97,9 @@ class RotorTerm(Term):
         what is added anyway, in m/s, shape ``(point, latent + 1)``; and the points.
     trim
         Coefficients of `factors`, shape ``(2, 6)``.
+    induction, pace
+        Splines of `make_induction`, and what is learnt of its lag, shape ``(2,)``; the
+        first is empty where nothing lags.
     grid
         Where the splines lie.
     about
@@ -106,16 +113,37 @@ class RotorTerm(Term):
     late: jax.Array
     grid_of_late: jax.Array
     trim: jax.Array
+    induction: jax.Array
+    pace: jax.Array
     grid: Grid = eqx.field(static=True)
     about: RotorConstants = eqx.field(static=True)
 
     # -- evaluation -----------------------------------------------------------------------------
 
     def values(self, signals: jax.Array) -> jax.Array:
-        """Thrust in kN and torque in kN m at one sample, shape ``(signal,)`` to ``(2,)``."""
+        """Thrust in kN and torque in kN m at one sample, shape ``(signal,)`` to ``(2,)``.
+
+        With a lag the rate of the induced velocity in m/s² is the last of three.
+        """
         wind, speed, pitch = self.inflow(signals)
         # No direction of the inflow is lost: only its angle is asked of the spline.
         tips = jnp.sqrt(speed**2 + _CALM**2)
+        if not self.about.lags:
+            return self._forces(wind, tips, pitch)
+        induced, slope = settled(self.induction, self.grid, wind, tips, pitch)
+        missing = induced - signals[self._induced]
+        rate = missing / lag(self.about.radius, wind, tips, induced, self.pace)
+        seen = wind_of_inflow(wind, tips, missing, slope, self.pace)
+        return jnp.append(self._forces(seen, tips, pitch), rate)
+
+    def wake(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Settled induced velocity in m/s and the lag in s, ``(input,)`` to numbers."""
+        wind, speed, pitch = self.inflow(inputs[np.array(self.columns, dtype=int)])
+        tips = jnp.sqrt(speed**2 + _CALM**2)
+        induced, _ = settled(self.induction, self.grid, wind, tips, pitch)
+        return induced, lag(self.about.radius, wind, tips, induced, self.pace)
+
+    def _forces(self, wind: jax.Array, tips: jax.Array, pitch: jax.Array) -> jax.Array:
         forces = surface_values(self.weights, self.grid, wind, tips, pitch)
         forces = forces * self.factors(wind, tips, pitch)
         size = 0.5e-3 * self.about.density * np.pi * self.about.radius**2
@@ -132,6 +160,12 @@ class RotorTerm(Term):
         ahead = (self.grid.stretch * wind) ** 2
         y = (ahead - tips**2) / (ahead + tips**2)
         return 1 + self.trim @ jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y])
+
+    @property
+    def _induced(self) -> int:
+        """Where the induced velocity stands among the signals."""
+        motions = (self.about.arm is not None) + self.about.surges
+        return 3 + motions + self.gains.shape[0]
 
     def inflow(self, signals: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Wind at the rotor and speed of its tips in m/s, pitch in deg, each ``(...)``.
@@ -151,6 +185,7 @@ class RotorTerm(Term):
         if corrections := self.gains.shape[0]:
             wind = wind + signals[..., at : at + corrections] @ self.gains
             at += corrections
+        at += self.about.lags
         if latents := self.late.shape[1] - 1:
             shares = hats(self.grid_of_late, signals[..., at + latents])
             added = signals[..., at : at + latents] @ self.late[:, :-1].T + self.late[:, -1]
@@ -206,6 +241,29 @@ class RotorTerm(Term):
             about=replace(self.about, inputs=(*self.about.inputs, *names)),
         )
 
+    @property
+    def wake_column(self) -> int | None:
+        """Column in I of the induced velocity, where it is a state."""
+        return self.columns[self._induced] if self.about.lags else None
+
+    def lagging(self, name: str, column: int) -> RotorTerm:
+        """The term of a model in which the induced velocity is a state.
+
+        Parameters
+        ----------
+        name, column
+            Of that state, and where it stands in I.
+        """
+        rate = Channel(f"{name}_rate", "m/s2")
+        about = replace(self.about, inputs=(*self.about.inputs, name), lags=True)
+        return replace(
+            self,
+            columns=(*self.columns, column),
+            channels=(*self.channels, rate),
+            induction=jnp.asarray(make_induction(np.asarray(self.weights), self.grid)),
+            about=about,
+        )
+
     # -- what the fit knows of it -----------------------------------------------------------------
 
     @property
@@ -257,21 +315,25 @@ class RotorTerm(Term):
 
     @property
     def parameters(self) -> tuple[jax.Array, ...]:
-        """The weights of the corrections, if there are any."""
+        """What it learns: weights of corrections and latent states, factors, the lag's length."""
         late = (self.late,) if self.late.shape[1] > 1 else ()
         trim = (self.trim,) if self.about.uncertainty else ()
-        return (*((self.gains,) if self.gains.shape[0] else ()), *late, *trim)
+        pace = (self.pace,) if self.about.lags else ()
+        return (*((self.gains,) if self.gains.shape[0] else ()), *late, *trim, *pace)
 
     def moved(self, deviations: Sequence[jax.Array]) -> RotorTerm:
-        """The term with other weights of the corrections."""
+        """The term with other values of these."""
         gains, late, trim, rest = self.gains, self.late, self.trim, list(deviations)
+        pace = self.pace
         if gains.shape[0]:
             gains = gains + self.scale * rest.pop(0)
         if late.shape[1] > 1:
             late = late + rest.pop(0)
         if self.about.uncertainty:
             trim = trim + self.about.uncertainty * rest.pop(0)
-        return replace(self, gains=gains, late=late, trim=trim)
+        if self.about.lags:
+            pace = pace + rest.pop(0)
+        return replace(self, gains=gains, late=late, trim=trim, pace=pace)
 
     # -- model folders --------------------------------------------------------------------------
 
@@ -283,7 +345,8 @@ class RotorTerm(Term):
         """Splines, weights of the corrections and their scale."""
         arrays = {"weights": self.weights, "gains": self.gains, "scale": self.scale}
         late = {"late": self.late, "grid_of_late": self.grid_of_late}
-        return arrays | late | {"trim": self.trim}
+        induction = {"induction": self.induction, "pace": self.pace}
+        return arrays | late | {"trim": self.trim} | (induction if self.about.lags else {})
 
     @classmethod
     def restored(
@@ -294,7 +357,7 @@ class RotorTerm(Term):
         structure: Mapping[str, Any],
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
-        told = {"memory": "speed", "uncertainty": 0.0, **structure["about"]}
+        told = {"memory": "speed", "uncertainty": 0.0, "lags": False, **structure["about"]}
         # JSON turns tuples into lists, which are no keys of compiled functions.
         about: dict[str, Any] = {
             f.name: tuple(told[f.name]) if isinstance(told[f.name], list) else told[f.name]
@@ -310,6 +373,8 @@ class RotorTerm(Term):
             late=arrays.get("late", from_host(np.zeros((1, 1)))),
             grid_of_late=arrays.get("grid_of_late", from_host(np.zeros(1))),
             trim=arrays.get("trim", from_host(np.zeros((2, 6)))),
+            induction=arrays.get("induction", from_host(np.zeros((2, 0, 0)))),
+            pace=arrays.get("pace", from_host(np.zeros(2))),
             grid=Grid(**structure["grid"]),
             about=RotorConstants(**about),
         )
