@@ -15,6 +15,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
+from benchmarks.outb import outb_bytes
 from dfsm.config.control import ControlConfig
 from dfsm.config.fit import parse_candidates, parse_config
 from dfsm.config.parse import parse_file
@@ -104,7 +105,11 @@ def _tables(folder: Path) -> list[Sample]:
         kept = name.endswith("parquet")
         found.append(_file(name, (folder / name).read_bytes(), _said, folder, checked=kept))
     found.append(_file("run.out", _out(run), _said, folder))
-    found.append(_file("run.outb", _outb(run), _said, folder))
+    units = [c.unit for c in run.channels]
+    outb = outb_bytes(run.time, run.values, run.names, units)
+    for name, raw in (("run.outb", outb), ("run.lvm", _lvm(run)), ("toa5.csv", _toa5(run))):
+        found.append(_file(name, raw, _said, folder))
+    found.append(_file("commas.csv", _commas(run), _said, folder))
     found.append(_file("field.bts", wind_field(), _wind, folder))
     found.append(_file("gust.wnd", _GUST, _uniform, folder))
     found.append(_bladed(run, folder))
@@ -160,16 +165,41 @@ def _out(run: Trajectory) -> bytes:
     return "\n".join([*lines, ""]).encode()
 
 
-def _outb(run: Trajectory) -> bytes:
-    low, high = run.values.min(axis=0), run.values.max(axis=0)
-    scale = (65535 / (high - low)).astype(np.float32)
-    offset = (-32768 - low * scale).astype(np.float32)
-    codes = np.clip(np.rint(run.values * scale + offset), -32768, 32767).astype("<i2")
-    parts = [struct.pack("<hii", 2, len(run.names), len(run)), struct.pack("<dd", 0.0, 0.05)]
-    parts += [scale.tobytes(), offset.tobytes(), struct.pack("<i", 4) + b"made"]
-    parts += [n.encode().ljust(10) for n in ("Time", *run.names)]
-    parts += [u.encode().ljust(10) for u in ("(s)", *(f"({c.unit})" for c in run.channels))]
-    return b"".join([*parts, codes.tobytes()])
+def _lvm(run: Trajectory) -> bytes:
+    """Two segments of LabVIEW that follow one another by their times, with decimal commas."""
+    lines = ["LabVIEW Measurement", "Separator\tTab", "Decimal_Separator\t,", "X_Columns\tNo"]
+    lines += ["***End_of_Header***", ""]
+    for first, clock in ((0, "10:00:00,5"), (30, "10:00:02,0")):
+        told = {"Date": "2020/01/02", "Time": clock, "X0": "0,0E+0", "Delta_X": "0,05"}
+        lines += ["Channels\t3", *("\t".join([tag, *[v] * 3]) for tag, v in told.items())]
+        lines.append("\t".join(["Y_Unit_Label", *(c.unit for c in run.channels)]))
+        lines += ["***End_of_Header***", "\t".join(["X_Value", *run.names, "Comment"])]
+        lines += _rows(run.values[first : first + 30], "\t", "\t")
+    return "\n".join([*lines, ""]).encode()
+
+
+def _commas(run: Trajectory) -> bytes:
+    """A table as spreadsheets write it where commas are decimal, with points between thousands."""
+    units = (f"{c.name} [{c.unit}]" for c in run.channels)
+    table = np.column_stack([run.time, 1e4 * run.values])
+    return "\n".join(["Zeit [s];" + ";".join(units), *_rows(table, ";"), ""]).encode()
+
+
+def _rows(table: Array, separator: str, before: str = "") -> list[str]:
+    points = str.maketrans(",.", ".,")
+    return [before + separator.join(f"{v:,.4f}" for v in row).translate(points) for row in table]
+
+
+def _toa5(run: Trajectory) -> bytes:
+    """A table of Campbell's loggers."""
+    lines = [
+        '"TOA5","Mast","CR1000","1","Std","CPU","2","Fast"',
+        '"TIMESTAMP","RECORD","q","w","y"',
+    ]
+    lines += ['"TS","RN","m","m/s","kN"', '"","","Smp","Smp","Smp"']
+    for k, (t, row) in enumerate(zip(run.time, run.values, strict=True)):
+        lines.append(f'"2020-01-02 10:00:0{t:.4g}",{k},' + ",".join(f"{v:.5g}" for v in row))
+    return "\n".join([*lines, ""]).encode()
 
 
 def wind_field() -> bytes:

@@ -11,7 +11,6 @@ command runs in a process of its own, whose highest resident memory the system t
 from __future__ import annotations
 
 import os
-import struct
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -21,13 +20,16 @@ from typing import Any
 import numpy as np
 import scipy
 
+from benchmarks.outb import outb_header, write_outb
 from benchmarks.process import usage
 from benchmarks.startup import ROOT
 from dfsm.core.types import Array
 
 RUNS = (50, 200, 500)
 CHANNELS, LONG = 70, 10_000_000
-STEP = 0.05  # s
+SAMPLES, STEP = 12_001, 0.05  # s
+NAMES = ["Pitch", "Force", "Wind", "Load", *(f"Other{k}" for k in range(CHANNELS - 4))]
+UNITS = ["deg", "kN", "m/s", "kN-m", *["m"] * (CHANNELS - 4)]
 CONFIG = """
 data: {train: ["run[0-9]*.outb"]}
 signals:
@@ -49,7 +51,9 @@ def run() -> dict[str, Any]:
         for number in range(max(RUNS)):
             if number in RUNS:
                 figures[f"fit, {number} runs"] = peak(place, ["fit", "config.yaml", "-o", "model"])
-            _write(place / f"run{number:03d}.outb", _channels(number))
+            time = STEP * np.arange(SAMPLES)
+            channels = _channels(number, time)
+            write_outb(place / f"run{number:03d}.outb", time, channels, NAMES, UNITS)
         figures[f"fit, {max(RUNS)} runs"] = peak(place, ["fit", "config.yaml", "-o", "model"])
         long_run(place / "long.outb")
         figures["info, 1e7 samples"] = peak(place, ["info", "long.outb"])
@@ -70,10 +74,9 @@ def memory_table(figures: Mapping[str, float]) -> list[str]:
     return rows + [f"| `dfsm {name}` | {told:.0f} MB |" for name, told in figures.items()]
 
 
-def _channels(number: int) -> Array:
+def _channels(number: int, time: Array) -> Array:
     """Samples of one run, ``(time, channel)``: the four that are read, then the others."""
     rng = np.random.default_rng(number)
-    time = STEP * np.arange(12_001)
     knots = np.arange(0.0, time[-1] + 5.0, 5.0)
     force, wind = (
         scipy.interpolate.CubicSpline(knots, rng.normal(size=len(knots)))(time) for _ in range(2)
@@ -87,30 +90,11 @@ def _channels(number: int) -> Array:
     return np.column_stack([states[:, 0], force, wind, load, others])
 
 
-def _write(path: Path, values: Array) -> None:
-    low, high = values.min(axis=0), values.max(axis=0)
-    scale = (65535 / (high - low)).astype(np.float32)
-    offset = (-32768 - low * scale).astype(np.float32)
-    codes = np.clip(np.rint(values * scale + offset), -32768, 32767).astype("<i2")
-    path.write_bytes(_header(len(codes), scale, offset) + codes.tobytes())
-
-
-def _header(samples: int, scale: Array, offset: Array) -> bytes:
-    count = len(scale)
-    names = ["Pitch", "Force", "Wind", "Load", *(f"Other{k}" for k in range(count - 4))]
-    units = ["deg", "kN", "m/s", "kN-m", *["m"] * (count - 4)]
-    parts = [struct.pack("<hiidd", 2, count, samples, 0.0, STEP)]
-    parts += [scale.tobytes(), offset.tobytes(), struct.pack("<i", 4) + b"made"]
-    parts += [n.encode().ljust(10) for n in ("Time", *names)]
-    parts += [f"({u})".encode().ljust(10) for u in ("s", *units)]
-    return b"".join(parts)
-
-
 def long_run(path: Path) -> None:
     """Write one run of 1e7 samples, part by part."""
     rng = np.random.default_rng(0)
     scale, offset = np.full(8, 3e4, np.float32), np.zeros(8, np.float32)
     with path.open("wb") as stream:
-        stream.write(_header(LONG, scale, offset))
+        stream.write(outb_header(NAMES[:8], UNITS[:8], LONG, (0.0, STEP), (scale, offset)))
         for _ in range(0, LONG, LONG // 10):
             stream.write(rng.integers(-30000, 30000, (LONG // 10, 8)).astype("<i2").tobytes())

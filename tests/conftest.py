@@ -23,10 +23,10 @@ import pytest
 from ruamel.yaml import YAML
 from threadpoolctl import threadpool_limits
 
+from benchmarks.outb import write_outb
 from dfsm import cli
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Trajectory
-from outb import write_outb
 from systems import DUFFING
 
 CONFIG: dict[str, Any] = {

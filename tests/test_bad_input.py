@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.outb import outb_bytes, smooth_run
 from conftest import CONFIG, changed, files_of, renamed, write_config
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Trajectory
-from outb import outb_bytes, smooth_run
 
 NAMES, UNITS = ("a", "b", "c"), ("m", "", "kN")
 NONE = {"kind": "none"}

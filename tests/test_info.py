@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.outb import outb_bytes
 from dfsm.data import readers
 from dfsm.data.info import describe
 from dfsm.data.readers import describe_all, openfast, parquet, read, write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.errors import DfsmError
-from outb import outb_bytes
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 

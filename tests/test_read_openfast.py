@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.outb import encode, outb_bytes, smooth_run, write_outb
 from dfsm.data.readers import read, read_all
 from dfsm.data.readers.openfast import read_openfast
 from dfsm.data.wind import undisturbed_rotor_wind, wind_warning
 from dfsm.errors import DfsmError
-from outb import encode, outb_bytes, smooth_run, write_outb
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 REAL = EXAMPLES / "iea15_2dof_12mps_s09.outb"

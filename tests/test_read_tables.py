@@ -16,12 +16,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from benchmarks.outb import smooth_run, write_outb
 from dfsm.data.readers import read
 from dfsm.data.readers.openfast import read_openfast
 from dfsm.data.readers.tables import read_table, write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-from outb import smooth_run, write_outb
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "iea15"
 quick = settings(

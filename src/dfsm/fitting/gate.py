@@ -86,8 +86,7 @@ def correct(
     derivatives = targets is samples.derivatives
     # Outputs of hidden states, which nothing is to correct, come after those that were fitted.
     targets = targets[:, : linear.model.coefficients.shape[1]]
-    residuals = left_over(linear.model, samples, inputs, targets, range(targets.shape[1]))
-    rms = rms_over(residuals, samples.weights)
+    rms = _rms_left(linear.model, samples, inputs, targets)
     std = std_over(targets, samples.weights)
     ratio = rms / np.maximum(std, np.finfo(float).tiny)
     known = kinematic_rows(settings.states) if derivatives else {}
@@ -100,8 +99,9 @@ def correct(
     ]
     hidden, trained = linear.model.hidden_among(samples.inputs.shape[1]), None
     if large and not later:
+        residuals = left_over(linear.model, samples, inputs, targets, large)
         inputs = samples.without_terms(inputs)
-        trained = _train(inputs, residuals[:, large], hidden, samples, settings)
+        trained = _train(inputs, residuals, hidden, samples, settings)
     function, explained, detail = None, dict[int, float](), ""
     if trained is not None:
         explained, detail = dict(zip(large, trained.explained, strict=True)), trained.detail
@@ -174,6 +174,18 @@ def left_over(
     for rows in samples.parts:
         residuals[rows] = (targets[rows] - predicted(model, inputs[rows]))[:, columns]
     return residuals
+
+
+def _rms_left(model: LinearModel, samples: Samples, inputs: Array, targets: Array) -> Array:
+    """Root mean square of what a linear fit leaves of every target, which is kept nowhere."""
+    squares, total = np.zeros(targets.shape[1]), 0.0
+    every = range(targets.shape[1])
+    for part, wanted, weights in samples.weighted_blocks(inputs, targets, every):
+        count = len(part) if weights is None else float(weights.sum())
+        left = wanted - predicted(model, part)
+        squares += count * rms_over(left, weights) ** 2
+        total += count
+    return np.sqrt(squares / total)
 
 
 def predicted(model: LinearModel, inputs: Array) -> Array:

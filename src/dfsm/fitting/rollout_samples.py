@@ -19,6 +19,9 @@ from dfsm.models.dfsm import DFSM
 from dfsm.simulation.hidden import latents_along
 from dfsm.simulation.simulate import Status, simulate
 
+# Runs that are simulated at once: rollouts of all would take as much memory as the samples.
+_AT_ONCE = 64
+
 
 def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSettings) -> Samples:
     """Add the latent states of a model to the inputs of recorded samples, and take its terms."""
@@ -59,13 +62,15 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
     if not model.signals.telling:
         # Its outputs are what is going to be fitted.
         model = replace(model, signals=replace(model.signals, outputs=()))
-    with hushed():
-        rollouts = simulate(model, list(data), start=settings.start, stop=settings.stop)
-    inputs = samples.inputs.copy()
+    inputs, parts = samples.inputs.copy(), samples.parts
     names = model.signals.names("states")
     columns = model.signals.state_columns
-    for run, rollout, rows in zip(data, rollouts, samples.parts, strict=True):
-        if rollout.status is Status.COMPLETED:
-            inside = rollout.trajectory.window(known_from(run, settings), settings.stop)
-            inputs[rows, columns] = inside.select(names).values
+    for first in range(0, len(data), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        with hushed():
+            rollouts = simulate(model, data[some], start=settings.start, stop=settings.stop)
+        for run, rollout, rows in zip(data[some], rollouts, parts[some], strict=True):
+            if rollout.status is Status.COMPLETED:
+                inside = rollout.trajectory.window(known_from(run, settings), settings.stop)
+                inputs[rows, columns] = inside.select(names).values
     return replace(samples, inputs=inputs)

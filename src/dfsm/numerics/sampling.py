@@ -20,6 +20,8 @@ Method = Literal["kmeans", "maxmin", "random"]
 # k-means++ places its centres on at most this many samples per centre, drawn at random: samples
 # of one run 0.05 s apart are near copies, and the means are then taken over all of them.
 _SAMPLES_PER_CENTRE = 50
+# Samples whose nearest point is looked for at once.
+_TOGETHER = 2**16
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,10 @@ def nearest(inputs: Samples, points: Points) -> Labels:
     """Index of the nearest point for every sample, by Euclidean distance."""
     from scipy.spatial import KDTree
 
-    _, index = KDTree(points).query(inputs)
-    return np.asarray(index, dtype=np.int64)
+    tree, index = KDTree(points), np.empty(len(inputs), dtype=np.int64)
+    for start in range(0, len(inputs), _TOGETHER):
+        _, index[start : start + _TOGETHER] = tree.query(inputs[start : start + _TOGETHER])
+    return index
 
 
 def _kmeans(inputs: Samples, size: int, rng: np.random.Generator) -> Points:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dfsm.core.types import Array, IntArray
 from dfsm.models.corrective import Corrective
 from dfsm.numerics.sampling import maxmin
+from dfsm.numerics.time_mesh import std_over
 
 # Cross-validation and iterative training see at most this many samples, evenly thinned.
 SEARCH_SAMPLES = 12_000
@@ -69,16 +70,18 @@ class TrainingSet:
     @classmethod
     def build(cls, inputs: Array, targets: Array, runs: IntArray) -> TrainingSet:
         """Standardise samples; `runs` holds the run index of each, shape ``(sample,)``."""
-        shift, scale = inputs.mean(0), inputs.std(0)
+        shift, scale = inputs.mean(0), std_over(inputs, None)
         scale = np.where(scale > 1e-12 * np.maximum(np.abs(shift), 1e-300), scale, 1.0)
-        target_scale = np.maximum(targets.std(0), np.finfo(float).tiny)
+        target_scale = np.maximum(std_over(targets, None), np.finfo(float).tiny)
         n_runs = int(runs.max()) + 1
         if n_runs > 1:
             folds = (runs * min(4, n_runs)) // n_runs
         else:
             folds = (np.arange(len(inputs)) * 4) // len(inputs)
+        z = inputs - shift
+        z /= scale
         return cls(
-            (inputs - shift) / scale,
+            z,
             targets / target_scale,
             runs,
             folds,
@@ -106,7 +109,7 @@ class TrainingSet:
     @property
     def typical_distance(self) -> float:
         """Root-mean-square distance between two samples drawn at random."""
-        return float(np.sqrt(2 * self.z.var(0).sum()))
+        return float(np.sqrt(2 * np.sum(std_over(self.z, None) ** 2)))
 
     def stretched(self, lengths: Array) -> TrainingSet:
         """Measure every input in a length of its own, shape ``(input,)``."""
