@@ -230,16 +230,18 @@ def _table(
         headers = [h for name in names for h in (f"{_TIME} of {name}", name)]
     elif file.timed == "one":
         headers = [_TIME, *names]
-    elif wrong := next((r for r in rows if number(r.cells[0].replace(",", ".") or "x")), None):
+    elif wrong := next((r for r in rows if r.cells[0] and _begins_row(r.cells)), None):
         raise DfsmError(
             f"{file.path}, line {wrong.line}: {wrong.cells[0][:24]!r} stands where X_Columns No "
             "leaves nothing: correct it or remove the line"
         )
     first = int(file.timed == "no")
     width = first + len(headers)
-    # Behind the channels there may be a comment, and a separator behind that.
+    # Behind the channels there may be a comment, and a separator behind that; words may follow.
     rows = [
-        Row(r.line, (r.cells if any(r.cells[width + 1 :]) else r.cells[:width])[first:])
+        Row(r.line, (r.cells if any(r.cells[width + 1 :]) else r.cells[:width])[first:] or [""])
+        if not r.cells[0] or file.timed != "no"
+        else r
         for r in rows
     ]
     note = ""
