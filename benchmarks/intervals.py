@@ -99,7 +99,8 @@ def _turbine() -> Case:
     training = [*turbine.runs(rotor.WINDS, range(1, 3)), *turbine.perturbed(testing=False)]
     base = rotor.settings(())
     table = replace(base.terms[0], memory="speed", induction="steady", uncertainty=0.0)
-    bare = {"corrective": dfsm.NoCorrection(), "azimuth": None, "outputs": ("TwrBsMyt",)}
+    kept = {"corrected": None, "azimuth": None, "outputs": ("TwrBsMyt",)}
+    bare = {"corrective": dfsm.NoCorrection(), **kept}
     return Case(
         training,
         replace(base, **bare, terms=(table,)),

@@ -38,7 +38,7 @@ def run() -> dict[str, Any]:
     training = rotor.with_rings(training)
     tests = {label: rotor.with_rings(runs) for label, runs in tests.items()}
     plain = uncorrected(turbine)
-    bare = {"corrective": dfsm.NoCorrection(), "outputs": ()}
+    bare = {"corrective": dfsm.NoCorrection(), "corrected": None, "outputs": ()}
     whole = replace(rotor.settings(), **bare)
 
     def with_rotor(settings: dfsm.FitSettings, **changes: Any) -> dfsm.FitSettings:

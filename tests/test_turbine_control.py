@@ -208,7 +208,15 @@ def test_the_page_holds_every_series_and_the_figures_every_limit(
     found: ControlStudy, tmp_path: Path
 ):
     article = control_article(found)
-    for figure in article.figures():
+    power, *others = article.figures()
+    assert article.sections[0].figures == (power,)
+    assert article.sections[0].paragraphs[0] == f"{len(found.results)} of {len(found.results)} " + (
+        "problems were solved."
+    )
+    best = {r.most_pitch: r.power for r in found.results if r.variant == "b"}
+    (curve,) = next(p for p in power.panels if p.title == "case b").curves
+    assert dict(zip(curve.x, curve.y, strict=True)) == best
+    for figure in others:
         assert figure.stacked
         assert [p.title.split(" (")[0] for p in figure.panels] == [
             *("RotWind", TORQUE, BLADE, PITCH, SPEED, "power", SHEAR, MOMENT)

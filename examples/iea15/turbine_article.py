@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
-from dfsm.report.article import Article, Figure, Section, Table, cell_text, listed
+import numpy as np
+
+from dfsm.report.article import (
+    Article,
+    Curve,
+    Figure,
+    Panel,
+    Section,
+    Table,
+    cell_text,
+    listed,
+)
 from dfsm.report.control_figures import stacked_figure
 from turbine_control import ControlStudy, Result
 from turbine_problem import (
@@ -74,9 +85,46 @@ def control_article(study: ControlStudy) -> Article:
             "turbine that was simulated and a model refined on rollouts that knows some mechanics."
         ),
         sections=(
+            answer_section(study),
             trends_section(study),
             *[_series_section(name, results) for name, results in groups.items()],
         ),
+    )
+
+
+# -- the answer ---------------------------------------------------------------------------------
+
+
+def answer_section(study: ControlStudy) -> Section:
+    """How many problems were solved, and the power at every limit of the platform pitch."""
+    solved = [r for r in study.results if r.solution.solved]
+    sentences = [f"{len(solved)} of {len(study.results)} problems were solved."]
+    curves: dict[str, list[Curve]] = {}
+    for (name, variant), by_limit in study.series().items():
+        kept = [by_limit[limit] for limit in sorted(by_limit) if by_limit[limit].solution.solved]
+        if not kept:
+            continue
+        limits, power = [r.most_pitch for r in kept], [r.power for r in kept]
+        panel = curves.setdefault(variant, [])
+        panel.append(Curve(_short(name), np.array(limits), np.array(power), len(panel) + 1))
+        if variant == "b" and len(kept) > 1:
+            cost = 1 - power[0] / power[-1]
+            sentences.append(
+                f"{_short(name)}: {power[-1]:.2f} MW with Θp,max = {limits[-1]:g} deg, and "
+                f"{cost:.1%} less with {limits[0]:g} deg."
+            )
+    most = 1.1 * max((r.power for r in solved), default=1.0)
+    figure = Figure(
+        "control_power",
+        "Mean electrical power of the optimum over the limit of the platform pitch",
+        tuple(
+            Panel(f"case {variant}", "Θp,max (deg)", "power (MW)", tuple(of), y_range=(0.0, most))
+            for variant, of in curves.items()
+        ),
+    )
+    figures = (figure,) if curves else ()
+    return Section(
+        "answer", "What it costs to keep the platform upright", tuple(sentences), (), figures
     )
 
 
