@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from dfsm.core.host import from_host
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.corrective import GaussianUnits
@@ -175,14 +175,15 @@ def linear_model(
         G = np.concatenate([D, C], axis=1)
         if azimuth is not None:
             G = np.concatenate([G, np.tile([1.0, 0.0], (p, 1))], axis=1)
-        g = LinearModel(jnp.zeros(1), jnp.asarray(G)[None], jnp.zeros((1, p)), None)
-    ends = jnp.full(n + m, span)
+        g = _linear(G)
+    ends = np.full(n + m, span)
+    region = (-ends, ends, 0 * ends, ends / 3, np.zeros(1), np.zeros((1, n + m)))
     return DFSM(
-        f=LinearModel(jnp.zeros(1), jnp.asarray(L)[None], jnp.zeros((1, n)), None),
+        f=_linear(L),
         e=corrective,
         g=g,
         e_g=None,
-        region=Region(-ends, ends, 0 * ends, ends / 3, jnp.zeros(1), jnp.zeros((1, n + m))),
+        region=Region(*map(from_host, region)),
         corrected=(n - 1,) if corrective is not None else (),
         corrected_outputs=(),
         signals=SignalTable(
@@ -196,6 +197,11 @@ def linear_model(
             azimuth=azimuth,
         ),
     )
+
+
+def _linear(L: np.ndarray) -> LinearModel:
+    """Constant coefficients ``(target, input)`` and no offset."""
+    return LinearModel(*map(from_host, (np.zeros(1), L[None], np.zeros((1, len(L))))), None)
 
 
 def driving_run(

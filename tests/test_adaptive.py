@@ -85,7 +85,7 @@ def simulated(found):
 
 @pytest.fixture(scope="module")
 def truth():
-    return dfsm.solve(problem(PENDULUM), METHOD)
+    return dfsm.solve(problem(PENDULUM), METHOD, simulate=False)
 
 
 # -- the loop -----------------------------------------------------------------------------------
@@ -148,7 +148,9 @@ def test_the_price_of_a_miss_is_what_ending_there_costs_less(truth):
     missed = realised(problem(PENDULUM), truth, moved)
     assert missed.miss["angle"] == pytest.approx(exact.miss["angle"] + step)
     ends = [
-        dfsm.solve(problem(PENDULUM, final={"angle": 1.8 + d, "speed": 0.0}), METHOD).objective
+        dfsm.solve(
+            problem(PENDULUM, final={"angle": 1.8 + d, "speed": 0.0}), METHOD, simulate=False
+        ).objective
         for d in (-step, step)
     ]
     slope = (ends[1] - ends[0]) / (2 * step)
@@ -172,21 +174,22 @@ def test_runs_and_problems_that_do_not_fit_earn_a_sentence(truth):
 
 
 def test_the_robot_of_the_adaptive_study():
-    found = dfsm.solve(adaptive_robot.problem(adaptive_robot.ROBOT), adaptive_robot.METHOD)
+    robot = adaptive_robot.problem(adaptive_robot.ROBOT)
+    found = dfsm.solve(robot, adaptive_robot.METHOD, simulate=False)
     assert found.objective == pytest.approx(5.2337355, rel=1e-6)
-    costs = realised(
-        adaptive_robot.problem(adaptive_robot.ROBOT), found, adaptive_robot.simulated(found)
-    )
+    costs = realised(robot, found, adaptive_robot.simulated(found))
     assert costs.cost + costs.price == pytest.approx(found.objective, rel=1e-3)
     assert len(adaptive_robot.training_runs(3, 0)) == 3
 
 
 def test_the_arm_of_the_codesign_study():
-    arm, method = codesign.ARM, METHOD
-    truth = dfsm.solve(codesign.problem(arm), method)
+    def solved(*mass):
+        return dfsm.solve(codesign.problem(codesign.ARM, *mass), METHOD, simulate=False)
+
+    truth = solved()
     best = truth.parameters["m2"]
     assert 2.4 < best < 2.6
-    costs = [dfsm.solve(codesign.problem(arm, m), method).objective for m in (best, 2.3, 2.7)]
+    costs = [solved(m).objective for m in (best, 2.3, 2.7)]
     assert costs[0] == pytest.approx(truth.objective, rel=1e-6)
     assert min(costs[1:]) > 1.002 * truth.objective
 
@@ -197,7 +200,7 @@ def test_mass_and_torques_on_a_small_surrogate():
     assert len(runs) == 18
     assert {float(r["m2"][0]) for r in runs} == {2.0, 2.5, 3.0}
     model = codesign.surrogate(runs, dfsm.GP(samples=60))
-    found = dfsm.solve(codesign.problem(model), METHOD)
+    found = dfsm.solve(codesign.problem(model), METHOD, simulate=False)
     assert found.solved
     assert 2.0 <= found.parameters["m2"] <= 3.0
 

@@ -179,7 +179,7 @@ def test_rates_and_path_constraints_are_named_where_they_leave_no_point():
 
 
 def test_an_unbounded_problem_names_what_runs_away():
-    found = solve(moved(final={}, cost=lambda s: s.x.x), COARSE)
+    found = solve(moved(final={}, cost=lambda s: s.x.x), COARSE, simulate=False)
     assert found.ending is Ending.UNBOUNDED
     assert not found.solved
     assert found.reason.startswith("u runs away to -")

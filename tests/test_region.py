@@ -138,7 +138,11 @@ def test_an_optimum_stays_near_the_data_if_asked(model):
         bounds={"u": (-40.0, 40.0), "q": (-20.0, 20.0)},
     )
     free, kept = (
-        solve(problem, DirectTranscription(mesh=20, refine=None, stay_inside=inside))
+        solve(
+            problem,
+            DirectTranscription(mesh=20, refine=None, stay_inside=inside),
+            simulate=False,
+        )
         for inside in (False, True)
     )
     assert free.solved
@@ -150,13 +154,13 @@ def test_an_optimum_stays_near_the_data_if_asked(model):
     # Solved without the distance, then with a bound on it that is four times tighter at most each
     # time; an optimum as the guess saves the first.
     method = DirectTranscription(mesh=20, refine=None, stay_inside=True)
-    again = solve(problem, method, free)
+    again = solve(problem, method, free, simulate=False)
     far = model.region.distance_chosen(free.trajectory.select(["u", "w", "q"]).values).max()
     assert len(again.meshes) == np.ceil(np.log(far) / np.log(4))
     assert len(kept.meshes) == len(again.meshes) + 1 > 2
     assert again.objective == pytest.approx(kept.objective, rel=1e-6)
     # Only the last bound is worth finer meshes.
-    refined = solve(problem, replace(method, refine=1e-6))
+    refined = solve(problem, replace(method, refine=1e-6), simulate=False)
     intervals = [mesh["intervals"] for mesh in refined.meshes]
     assert intervals[: len(kept.meshes)] == [20] * len(kept.meshes)
     assert refined.error <= 1e-6

@@ -66,6 +66,7 @@ def solution():
             name="spin up",
         ),
         DirectTranscription(mesh=30, refine=None),
+        simulate=False,
     )
     assert found.solved
     return found

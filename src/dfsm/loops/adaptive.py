@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dfsm.control.names import End, Signals
@@ -22,6 +21,7 @@ from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Ending, Solution
 from dfsm.control.solve import solve
 from dfsm.core.drawing import Engine, Shown, draw
+from dfsm.core.host import from_host
 from dfsm.core.progress import track
 from dfsm.core.renamed import renamed
 from dfsm.core.settings import require, settings_class
@@ -316,13 +316,13 @@ def realised(problem: OptimalControlProblem, solution: Solution, run: Trajectory
 def _cost(problem: OptimalControlProblem, solution: Solution, run: Trajectory) -> float:
     """M + ∫ L dt along a run."""
     plant = problem.plant
-    p = jnp.asarray([solution.parameters[n] for n in plant.names("parameters")])
+    p = from_host([solution.parameters[n] for n in plant.names("parameters")])
     x, u, w = (
-        jnp.asarray(run.select(plant.names(group)).values)
+        from_host(run.select(plant.names(group)).values)
         for group in ("states", "controls", "disturbances")
     )
     # Outputs as the true system gave them, and not what the surrogate makes of its states.
-    y = jnp.asarray(run.select(n for n in plant.names("outputs") if n in run).values)
+    y = from_host(run.select(n for n in plant.names("outputs") if n in run).values)
     total = 0.0
     if problem.cost is not None:
         cost, outputs = problem.cost, tuple(c for c in plant.channels["outputs"] if c.name in run)
@@ -332,7 +332,7 @@ def _cost(problem: OptimalControlProblem, solution: Solution, run: Trajectory) -
             true = replace(plant, channels=channels, output=lambda *_: y)
             return cost(Signals(true, t, (*values, p)))
 
-        rates = jax.vmap(integrand)(jnp.asarray(run.time), y, x, u, w)
+        rates = jax.vmap(integrand)(from_host(run.time), y, x, u, w)
         total += float(np.trapezoid(np.asarray(rates), run.time))
     if problem.final_cost is not None:
         ends = (End(plant, run.time[k], x[k], p) for k in (0, -1))
