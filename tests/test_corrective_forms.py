@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import dfsm
+from dfsm.core.host import from_host
 from dfsm.core.settings import settings_class
 from dfsm.fitting.corrective import CorrectiveFit, TrainingSet
 from dfsm.models.corrective import FORMS, Corrective, GaussianUnits, Perceptron
@@ -36,9 +37,9 @@ class Cubes(Corrective):
     def with_more_inputs(self, at: int, count: int) -> Cubes:
         place = np.full(count, at)
         return Cubes(
-            jnp.insert(self.shift, place, 0.0),
-            jnp.insert(self.scale, place, 1.0),
-            jnp.insert(self.matrix, place, 0.0, axis=1),
+            from_host(np.insert(self.shift, place, 0.0)),
+            from_host(np.insert(self.scale, place, 1.0)),
+            from_host(np.insert(self.matrix, place, 0.0, axis=1)),
         )
 
     @property
@@ -59,9 +60,7 @@ class LeastCubes:
         cubes = data.z**3
         A, left = np.linalg.lstsq(cubes, data.targets)[:2]
         function = Cubes(
-            jnp.asarray(data.shift),
-            jnp.asarray(data.scale),
-            jnp.asarray((A * data.target_scale).T),
+            *map(from_host, (data.shift, data.scale, (A * data.target_scale).T)),
         )
         return CorrectiveFit(function, 1 - left / len(cubes), "cubes")
 
@@ -70,7 +69,7 @@ def forms() -> dict[str, Corrective]:
     rng = np.random.default_rng(0)
 
     def normal(*shape: int) -> jax.Array:
-        return jnp.asarray(rng.normal(size=shape))
+        return from_host(rng.normal(size=shape))
 
     shift, scale = normal(3), 1 + normal(3) ** 2
     return {
@@ -94,7 +93,7 @@ POINTS = np.random.default_rng(1).normal(size=(20, 3))
 
 
 def values(function, points: np.ndarray) -> np.ndarray:
-    return np.asarray(jax.vmap(function)(jnp.asarray(points)))
+    return np.asarray(jax.vmap(function)(from_host(points)))
 
 
 def test_prepared_it_is_the_same_function(form):

@@ -34,9 +34,10 @@ def by_hand(w, z, sizes):
 @pytest.mark.parametrize("sizes", SIZES)
 def test_normal_equations_are_those_of_the_jacobian(sizes):
     w, z, targets = drawn(sizes)
-    residuals = np.asarray(jax.vmap(by_hand, (None, 0, None))(w, z, sizes)) - targets
-    slopes = jax.vmap(jax.jacrev(by_hand), (None, 0, None))(jnp.asarray(w), z, sizes)
-    J = np.asarray(slopes).reshape(-1, len(w))
+    slopes = jax.jacrev(by_hand)
+    both = jax.jit(jax.vmap(lambda *at: (by_hand(*at, sizes), slopes(*at, sizes)), (None, 0)))
+    found, J = map(np.asarray, both(w, z))
+    residuals, J = found - targets, J.reshape(-1, len(w))
     error = NetworkError.of(sizes, z, targets)
     JtJ, Jtr = error.normal_equations(w)
     np.testing.assert_allclose(JtJ, J.T @ J, rtol=0, atol=1e-11 * np.abs(J.T @ J).max())
@@ -47,14 +48,15 @@ def test_normal_equations_are_those_of_the_jacobian(sizes):
 @pytest.mark.parametrize("sizes", SIZES)
 def test_many_samples_at_once_are_the_samples_one_by_one(sizes):
     w, z, _ = drawn(sizes, 5)
-    found = np.asarray(evaluate(jnp.asarray(w), jnp.asarray(z), sizes))
-    np.testing.assert_allclose(found, [by_hand(w, row, sizes) for row in z], atol=1e-14)
+    found = np.asarray(evaluate(w, z, sizes))
+    one = jax.jit(lambda row: by_hand(w, row, sizes))
+    np.testing.assert_allclose(found, [one(row) for row in z], atol=1e-14)
 
 
 def test_steps_lead_to_the_network_that_made_the_targets():
     sizes = (2, 3, 2)
     w, z, _ = drawn(sizes)
-    targets = np.asarray(evaluate(jnp.asarray(w), jnp.asarray(z), sizes))
+    targets = np.asarray(evaluate(w, z, sizes))
     problem = NetworkError.of(sizes, z, targets)
     start = w + 0.3 * np.random.default_rng(1).normal(size=w.shape)
     costs = [

@@ -121,7 +121,9 @@ def test_jacobians_depend_on_the_mass_and_leave_it_out(model):
     assert A.shape == (4, 4)
     assert B.shape == (4, 2)
     heavier = model.jacobians(HELD, torques, (), [2.9])[1]
-    slopes = jax.jacfwd(lambda u, p: parameters.SYSTEM.f(parameters.HELD, u, np.zeros(0), p))
+    slopes = jax.jit(
+        jax.jacfwd(lambda u, p: parameters.SYSTEM.f(parameters.HELD, u, np.zeros(0), p))
+    )
     light, heavy = (
         np.abs(np.asarray(slopes(torques, np.array([mass])))).max() for mass in (2.4, 2.9)
     )
@@ -137,8 +139,13 @@ def test_slopes_in_the_mass_are_those_of_the_arm(model):
     # What co-design needs: ∂f/∂p, by differentiating the model like any function.
     order = [0, 2, 1, 3]
     torques, nothing = holding_torques(parameters.SYSTEM, parameters.HELD, [2.4]), np.zeros(0)
-    true = jax.jacfwd(lambda p: parameters.SYSTEM.f(parameters.HELD, torques, nothing, p))
-    found = jax.jacfwd(lambda p: model.derivative(HELD, torques, nothing, p))
+    true, found = (
+        jax.jit(jax.jacfwd(function))
+        for function in (
+            lambda p: parameters.SYSTEM.f(parameters.HELD, torques, nothing, p),
+            lambda p: model.derivative(HELD, torques, nothing, p),
+        )
+    )
     mass = np.array([2.4])
     expected = np.asarray(true(mass))[order]
     np.testing.assert_allclose(found(mass), expected, rtol=0, atol=0.05 * np.abs(expected).max())

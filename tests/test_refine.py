@@ -15,6 +15,7 @@ import pytest
 from scipy.signal import lsim
 
 from conftest import changed, write_config
+from dfsm.core.host import from_host
 from dfsm.data.derivatives import StateSpec
 from dfsm.data.hold_out import HoldOut
 from dfsm.data.trajectory import Channel, Trajectory
@@ -283,7 +284,7 @@ def test_curvature_of_slopes_that_grow_along_a_window():
     v = 0.5 + np.zeros((2 * steps + 1, 1))
     errors = np.random.default_rng(0).normal(size=(steps, 1))
     at, start = jnp.zeros(parameters.size), jnp.zeros((0, 2, 0))
-    drive = tuple(map(jnp.asarray, (v[:-2:2], v[1::2], v[2::2])))
+    drive = v[:-2:2], v[1::2], v[2::2]
     sums, totals = {}, {}
     compiled = eqx.filter_jit(sensitivities)
     for every in (1, 4):
@@ -365,18 +366,18 @@ def test_decay_keeps_a_model_near_its_start(runs, biased):
 @pytest.mark.parametrize("kind", ["units", "perceptron", "none"])
 def test_deviations_change_what_they_should(kind):
     rng = np.random.default_rng(0)
+
+    def drawn(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape)
+
     units = GaussianUnits(
-        jnp.zeros(3),
-        jnp.ones(3),
-        jnp.asarray(rng.normal(size=(3, 4))),
-        jnp.asarray(rng.normal(size=(1, 4))),
-        jnp.zeros(1),
+        *map(from_host, (np.zeros(3), np.ones(3), drawn(3, 4), drawn(1, 4), np.zeros(1)))
     )
     network = Perceptron(
-        jnp.zeros(3),
-        jnp.ones(3),
-        (jnp.asarray(rng.normal(size=(4, 3))), jnp.asarray(rng.normal(size=(1, 4)))),
-        (jnp.zeros(4), jnp.zeros(1)),
+        from_host(np.zeros(3)),
+        from_host(np.ones(3)),
+        (from_host(drawn(4, 3)), from_host(drawn(1, 4))),
+        (from_host(np.zeros(4)), from_host(np.zeros(1))),
     )
     model = linear_model(OSCILLATOR_A, np.array([[0.0], [2.0]]))
     if kind != "none":
@@ -385,10 +386,10 @@ def test_deviations_change_what_they_should(kind):
     parameters = Parametrization.of(model, np.array([1.0, 2.0]))
     extra = {"units": 5, "perceptron": 21, "none": 0}[kind]
     assert parameters.size == 2 * 4 + extra
-    point = jnp.array([0.3, -0.2]), jnp.array([0.7]), jnp.zeros(0)
-    zero = jnp.zeros(parameters.size)
+    point = np.array([0.3, -0.2]), np.array([0.7]), np.zeros(0)
+    zero = from_host(np.zeros(parameters.size))
     np.testing.assert_array_equal(parameters.at(zero).derivative(*point), model.derivative(*point))
-    slopes = jax.jacfwd(lambda w: parameters.at(w).derivative(*point))(zero)
+    slopes = jax.jit(jax.jacfwd(lambda w: parameters.at(w).derivative(*point)))(zero)
     assert (np.abs(np.asarray(slopes)).max(axis=0) > 0).all()
     # Only the last row is corrected, and its spread is the unit of change.
     assert (np.asarray(slopes)[0, 8:] == 0).all()

@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +37,13 @@ def moving() -> RotorTerm:
 def evaluate(term: Term, wind, speed, pitch) -> Array:
     """Values of a rotor at many winds in m/s, speeds in rpm and pitch angles in deg."""
     signals = np.stack(np.broadcast_arrays(wind, speed, pitch), axis=-1).reshape(-1, 3)
-    return np.asarray(jax.jit(jax.vmap(term.values))(jnp.asarray(signals, dtype=float)))
+    return np.asarray(_values(term, signals.astype(float)))
+
+
+# Once for all terms of one form: most calls ask for a single point.
+@eqx.filter_jit
+def _values(term: Term, signals: Array) -> jax.Array:
+    return jax.vmap(term.values)(signals)
 
 
 def speed_at(ratio, wind):
@@ -112,12 +119,13 @@ def test_motion_and_corrections_change_the_wind(moving, plain):
 def test_derivative_with_respect_to_the_weights(moving):
     signals = jnp.array([11.0, 7.0, 4.0, 0.3, 0.5, 0.8, -0.6])
 
+    @jax.jit
     def values(deviation: jax.Array) -> jax.Array:
         return moving.moved([deviation]).values(signals)
 
-    at, step = jnp.array([0.1, 0.2]), 1e-5
-    numeric = [(values(at + step * e) - values(at - step * e)) / (2 * step) for e in jnp.eye(2)]
-    np.testing.assert_allclose(jax.jacfwd(values)(at), np.stack(numeric, 1), rtol=1e-6)
+    at, step = np.array([0.1, 0.2]), 1e-5
+    numeric = [(values(at + step * e) - values(at - step * e)) / (2 * step) for e in np.eye(2)]
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(values))(at), np.stack(numeric, 1), rtol=1e-6)
 
 
 def test_density_and_name():
@@ -176,6 +184,17 @@ def test_derivatives_agree_with_differences_everywhere(plain):
         assert (np.abs(slopes[..., k] - numeric) < 1e-5 * np.abs(numeric) + 1e-5 * scale).all()
 
 
+@eqx.filter_jit
+def _slopes(term: RotorTerm, a: Array, b: Array, at: Array) -> jax.Array:
+    """First and second derivatives along a line, ``(place, 2, value)``."""
+
+    def along(t: jax.Array) -> jax.Array:
+        return term.values(a + t * (b - a))
+
+    slope = jax.jacfwd(along)
+    return jax.vmap(lambda t: jnp.stack([slope(t), jax.jacfwd(slope)(t)]))(at)
+
+
 @pytest.mark.parametrize(
     ("start", "stop"),
     [
@@ -186,16 +205,10 @@ def test_derivatives_agree_with_differences_everywhere(plain):
     ],
 )
 def test_first_and_second_derivatives_have_no_steps(plain, start, stop):
-    a, b = jnp.array(start), jnp.array(stop)
-
-    def along(t: jax.Array) -> jax.Array:
-        return plain.values(a + t * (b - a))
-
-    slope = jax.jacfwd(along)
-    both = jax.jit(jax.vmap(lambda t: jnp.stack([slope(t), jax.jacfwd(slope)(t)])))
     widest = []
     for count in (2000, 4000):
-        values = np.asarray(both(jnp.linspace(0, 1, count + 1)))
+        at = np.linspace(0, 1, count + 1)
+        values = np.asarray(_slopes(plain, np.array(start), np.array(stop), at))
         widest.append(np.abs(np.diff(values, axis=0)).max(axis=0))
     # Steps of a continuous function shrink with the distance; a jump would stay.
     assert (widest[1] < 0.65 * widest[0]).all()
