@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import dfsm
 from benchmarks import parameters
 from conftest import write_config
+from dfsm import cli
 from dfsm.config.fit import parse_config
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
@@ -174,6 +176,36 @@ def springs() -> list[dfsm.Trajectory]:
     return [r for k in STIFFNESS for r in SPRING.many(2, [(1, 3), (k, 0)], time, seed=int(k))]
 
 
+@pytest.fixture(scope="module")
+def told(springs, tmp_path_factory) -> Path:
+    """A folder with the springs' records, and a model that the command line fitted to them."""
+    folder = tmp_path_factory.mktemp("springs")
+    for part in ("train", "test"):
+        (folder / part).mkdir()
+    for i, run in enumerate(springs):
+        write_table(run, folder / f"train/{i}.parquet")
+    write_config(
+        folder / "config.yaml",
+        {
+            "data": {"train": ["train/*.parquet"]},
+            "signals": {
+                "states": [{"name": "q", "order": 2, "rate": "v"}],
+                "controls": ["u"],
+                "parameters": ["k"],
+                "outputs": ["y"],
+            },
+            "corrective": {"kind": "mlp", "hidden": [10]},
+            "nonlinear_only": False,
+        },
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["dfsm", "fit", f"{folder}/config.yaml", "-o", f"{folder}/m"])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    assert stop.value.code == 0
+    return folder
+
+
 def spring_settings(**changes) -> dfsm.FitSettings:
     return dfsm.FitSettings(
         states=(dfsm.StateSpec(name="q", order=2, rate="v"),),
@@ -181,13 +213,14 @@ def spring_settings(**changes) -> dfsm.FitSettings:
         parameters=("k",),
         outputs=("y",),
         nonlinear_only=False,
-        **({"corrective": dfsm.MLP(hidden=(10,))} | changes),
+        corrective=dfsm.NoCorrection(),
+        **changes,
     )
 
 
-def test_steady_states_follow_a_parameter(springs):
+def test_steady_states_follow_a_parameter(told):
     # k q = 2 u, and y = k q
-    model = dfsm.fit(springs, spring_settings()).model
+    model = dfsm.load(told / "m")
     for k in (2.5, 4.5):
         found = dfsm.steady_state(model, controls=[1.0], parameters=[k])
         assert found.converged
@@ -205,9 +238,7 @@ def test_steady_states_follow_a_parameter(springs):
 @pytest.mark.parametrize("points", [3, 9])
 def test_a_linear_fit_may_be_scheduled_by_a_parameter(springs, points):
     # q̈ = -k q - …: what is linear in the schedule is exact at and between windows of one value.
-    choices = spring_settings(
-        linear=dfsm.LPV(schedule="k", points=points), corrective=dfsm.NoCorrection()
-    )
+    choices = spring_settings(linear=dfsm.LPV(schedule="k", points=points))
     model = dfsm.fit(springs, choices).model
     assert model.schedule == "k"
     for k in (3.5, 4.5, 5.0):
@@ -218,30 +249,12 @@ def test_a_linear_fit_may_be_scheduled_by_a_parameter(springs, points):
 # -- the command line ---------------------------------------------------------------------------
 
 
-def test_parquet_files_through_the_command_line(springs, tmp_path, monkeypatch, dfsm):
-    monkeypatch.chdir(tmp_path)
-    for part in ("train", "test"):
-        Path(part).mkdir()
-    for i, run in enumerate(springs):
-        write_table(run, f"train/{i}.parquet")
+def test_parquet_files_through_the_command_line(told, monkeypatch, dfsm):
+    monkeypatch.chdir(told)
     (unseen,) = SPRING.many(1, [(1, 3), (3.5, 0)], np.arange(0, 15.01, 0.05), seed=77)
     write_table(unseen, "test/unseen.parquet")
-    assert dfsm("init", "train/*.parquet").code == 0
-    assert parse_config(Path("config.yaml")).signals.parameters == ["k"]
-    write_config(
-        Path("config.yaml"),
-        {
-            "data": {"train": ["train/*.parquet"]},
-            "signals": {
-                "states": [{"name": "q", "order": 2, "rate": "v"}],
-                "controls": ["u"],
-                "parameters": ["k"],
-                "outputs": ["y"],
-            },
-            "corrective": {"kind": "mlp", "hidden": [10]},
-        },
-    )
-    assert dfsm("fit", "config.yaml", "-o", "m").code == 0
+    assert dfsm("init", "train/*.parquet", "-o", "proposed.yaml").code == 0
+    assert parse_config(Path("proposed.yaml")).signals.parameters == ["k"]
     assert "parameters: k (N/m)" in dfsm("summary", "m").out
     shown = dfsm("validate", "m", "test/*", "-o", "r.html", "--json", "m.json")
     assert shown.code == 0, shown

@@ -113,7 +113,7 @@ class Region(eqx.Module):
         Mahalanobis's, Σ_k h_k |W_k (I − μ_k)|² over the operating points k with hat functions h of
         the schedule. 98 % of the training samples are nearer, measured by the other runs.
         """
-        return self._squared(jnp.asarray(inputs), slice(None))
+        return self._squared(from_host(inputs), slice(None))
 
     def distance_chosen(self, inputs: ArrayLike, value: jax.Array | None = None) -> jax.Array:
         """What controls and states add to the distance, over what the disturbances leave for them.
@@ -131,5 +131,8 @@ class Region(eqx.Module):
     def _squared(self, inputs: jax.Array, rows: slice, value: jax.Array | None = None) -> jax.Array:
         if not self.whitening.size:
             return jnp.zeros(inputs.shape[:-1])
-        shares = hats(self.grid, inputs[..., self.schedule or 0] if value is None else value)
-        return squared_distance(inputs, shares, self.operating, self.whitening[:, rows])
+        W, schedule = self.whitening, inputs
+        if not traced(inputs, W):
+            W, schedule = np.asarray(W), np.asarray(inputs)
+        shares = hats(self.grid, schedule[..., self.schedule or 0] if value is None else value)
+        return squared_distance(inputs, shares, self.operating, W[:, rows])

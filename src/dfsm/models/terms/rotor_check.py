@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.core.units import agree, factor
 from dfsm.errors import DfsmError
@@ -43,7 +44,7 @@ def check_signals(term: RotorTerm, signals: Array) -> list[str]:
     DfsmError
         They cannot belong to this rotor and table.
     """
-    wind, tips, pitch = (np.asarray(a) for a in term.inflow(from_host(signals)))
+    wind, tips, pitch = map(np.asarray, _inflow(term, signals))
     return [
         *_check_ratio(term, wind, tips),
         *_check_pitch_range(term, pitch),
@@ -130,6 +131,16 @@ def _check_degrees(
 
 def _power(term: RotorTerm, rows: Array, tips: Array) -> tuple[float, float]:
     """Mean and standard deviation of the rotor's power, in kW."""
-    torque = np.asarray(jax.vmap(term.values)(from_host(rows)))[:, 1]
+    torque = np.asarray(_values(term, rows))[:, 1]
     power = torque * tips / term.about.radius
     return float(np.mean(power)), float(np.std(power))
+
+
+@eqx.filter_jit
+def _inflow(term: RotorTerm, signals: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return term.inflow(jnp.asarray(signals))
+
+
+@eqx.filter_jit
+def _values(term: RotorTerm, signals: Array) -> jax.Array:
+    return jax.vmap(term.values)(jnp.asarray(signals))
