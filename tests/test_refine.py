@@ -283,14 +283,13 @@ def test_curvature_of_slopes_that_grow_along_a_window():
     step, steps = 0.25, 40
     v = 0.5 + np.zeros((2 * steps + 1, 1))
     errors = np.random.default_rng(0).normal(size=(steps, 1))
-    at, start = jnp.zeros(parameters.size), jnp.zeros((0, 2, 0))
+    at = jnp.zeros(parameters.size)
+    start = jnp.zeros((0, 2, 0)), jnp.zeros((1, parameters.size))
     drive = v[:-2:2], v[1::2], v[2::2]
     sums, totals = {}, {}
     compiled = eqx.filter_jit(sensitivities)
     for every in (1, 4):
-        S, totals[every] = compiled(
-            parameters, at, step, jnp.zeros(1), start, drive, jnp.asarray(errors), every
-        )
+        S, totals[every] = compiled(parameters, at, step, jnp.zeros(1), start, drive, errors, every)
         J = np.asarray(S)[:, 0] * np.sqrt(spread_steps(steps, every)[1])[:, None]
         sums[every] = J.T @ J
     offset = parameters.size - 1
