@@ -320,8 +320,7 @@ def test_what_controls_drive_is_solved_for(model):
 
 def test_staying_inside_does_not_bind_what_only_disturbances_drive(by_wind):
     """Unusual wind takes latent states beyond their training range; nobody can help it."""
-    model = by_wind
-    run = driven(98)
+    run, model = driven(98), by_wind
     values = run.values.copy()
     values[:, run.names.index("w")] *= 1.6
     wild = replace(run, values=values)
@@ -348,9 +347,8 @@ def test_staying_inside_does_not_bind_what_only_disturbances_drive(by_wind):
 )
 def test_known_coefficients(runs, linear, rollouts, tmp_path):
     linear = replace(linear, known={"q": {"u": 0.125, "q": -0.4}}, margin=0.05)
-    choices = replace(SETTINGS, linear=linear)
     for refinement in (None, rollouts):
-        model = fit(runs, choices, refinement).model
+        model = fit(runs, replace(SETTINGS, linear=linear), refinement).model
         L = np.asarray(model.f.coefficients)
         assert (L[:, 0, 0] == 0.125).all()
         assert (L[:, 0, 2] == -0.4).all()
@@ -358,9 +356,8 @@ def test_known_coefficients(runs, linear, rollouts, tmp_path):
         assert not (np.asarray(model.g.coefficients)[:, 0, 0] == 0.125).any()
         save(model, tmp_path / "model")
         assert load(tmp_path / "model").f.known == ((0, 0), (0, 2))
-    # Nor does a network that rollouts have taught change them.
     if rollouts.network:
-        assert model.e is not None
+        assert model.e is not None  # taught by rollouts, and without a say in this
         assert_effect(model, 0.125)
 
 
