@@ -12,8 +12,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dfsm.numerics.hats import hats
-
 FilterState = tuple[jax.Array, ...]
 
 
@@ -154,7 +152,10 @@ def unwound(
 
 def lookup(points: jax.Array, values: jax.Array, at: jax.Array) -> jax.Array:
     """Linear between the points, constant beyond them."""
-    return hats(points, at) @ values
+    if len(points) == 1:
+        return values[0] + jnp.zeros_like(at)
+    i, along = _place(points, at)
+    return values[i] + along * (values[i + 1] - values[i])
 
 
 def lookup_2(

@@ -21,6 +21,7 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.loops.measures import Measure
 from dfsm.models.dfsm import DFSM
+from dfsm.models.staged import staged
 from dfsm.simulation.closed_loop import (
     ClosedLoopRun,
     LoopStatus,
@@ -118,7 +119,7 @@ class Evaluator:
         interval = float(tuned.controller.interval)
         self.cases = prepared_cases(model, runs, interval, window, settings)
         self.runs = [case.record for case in self.cases]
-        self._ready = model.stripped()
+        self._ready = staged(model)
         calls = enough_calls(*self.cases)
         self._drives = [padded(case, calls) for case in self.cases]
         self._controller = jax.tree.map(jnp.asarray, tuned.controller)

@@ -222,15 +222,6 @@ class DFSM(eqx.Module):
         e_g = None if self.e_g is None else self.e_g.prepared()
         return replace(self, e=e, e_g=e_g)  # pyright: ignore[reportArgumentType]
 
-    def stripped(self) -> DFSM:
-        """As `prepared`, without what has no effect: the last digits may be others.
-
-        Not within compiled code, where nobody knows what that is.
-        """
-        e = None if self.e is None else self.e.stripped()
-        e_g = None if self.e_g is None else self.e_g.stripped()
-        return replace(self, e=e, e_g=e_g)  # pyright: ignore[reportArgumentType]
-
     # -- derived models -------------------------------------------------------------------------
 
     def linear_fit(self) -> DFSM:
@@ -399,12 +390,19 @@ def _sum(
 ) -> jax.Array:
     """A linear fit, and its corrective function in some rows, at what each of them takes."""
     linear, corrective, rows = parts
-    total = linear(inputs[0], value)
+    return corrected(linear(inputs[0], value), (corrective, rows), inputs[1])
+
+
+def corrected(
+    total: jax.Array, by: tuple[Corrective | None, tuple[int, ...]], inputs: jax.Array
+) -> jax.Array:
+    """Values ``(row,)`` of a linear fit with a corrective function added in some rows."""
+    corrective, rows = by
     if corrective is None:
         return total
     # Written out per row: a scatter costs more than all the rest of a small model.
     place = {row: k for k, row in enumerate(rows)}
-    extra = corrective(inputs[1])
+    extra = corrective(inputs)
     return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(total)])
 
 

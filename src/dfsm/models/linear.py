@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
+from dfsm.core.host import from_host
 from dfsm.numerics.hats import hats
+
+# Numbers that a processor takes at once.
+_REGISTER = 4
 
 
 class LinearModel(eqx.Module):
@@ -60,11 +67,7 @@ class LinearModel(eqx.Module):
         """
         if self.schedule is None:
             return self.coefficients[0], self.offsets[0]
-        n = self.grid.shape[0]
-        value = jnp.clip(value, self.grid[0], self.grid[-1])
-        i = jnp.clip(jnp.sum(value >= self.grid) - 1, 0, n - 2)
-        ends = jax.lax.dynamic_slice_in_dim(self.grid, i, 2)
-        t = (value - ends[0]) / (ends[1] - ends[0])
+        i, t = _place(self.grid, value)
         # Slices of two points; general indexing costs several times as much in a rollout.
         L = jax.lax.dynamic_slice_in_dim(self.coefficients, i, 2)
         b = jax.lax.dynamic_slice_in_dim(self.offsets, i, 2)
@@ -81,3 +84,66 @@ class LinearModel(eqx.Module):
         """
         L, b = self.at(inputs[self.schedule or 0] if value is None else value)
         return L @ inputs + b
+
+
+class SplitLinear(eqx.Module):
+    """The same map, where what some inputs contribute is asked for by itself.
+
+    Attributes
+    ----------
+    grid
+        As of `LinearModel`.
+    first, then
+        Coefficients of some inputs and a 1, and of the others, in one row, schedule point by
+        schedule point and input by input, ``(point input target,)``: what is read lies together.
+        Zeros fill the targets of an input up to a whole number of a processor's registers.
+    targets, filled
+        Their number, without and with what fills them.
+    """
+
+    grid: jax.Array
+    first: jax.Array
+    then: jax.Array
+    targets: int = eqx.field(static=True)
+    filled: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, linear: LinearModel, first: Sequence[int], then: Sequence[int]) -> SplitLinear:
+        """The map of inputs in this order, which is another than that of the model's."""
+        targets = linear.offsets.shape[1]
+        filled = -(-targets // _REGISTER) * _REGISTER
+        more = ((0, 0), (0, 0), (0, filled - targets))
+        L = np.pad(np.swapaxes(np.asarray(linear.coefficients), 1, 2), more)
+        b = np.pad(np.asarray(linear.offsets)[:, None], more)
+        parts = np.concatenate([L[:, list(first)], b], axis=1), L[:, list(then)]
+        known, rest = (from_host(part.ravel()) for part in parts)
+        return cls(linear.grid, known, rest, targets, filled)
+
+    def __call__(self, first: jax.Array, then: jax.Array, value: jax.Array) -> jax.Array:
+        """Evaluate at two vectors of inputs, ``(input,)``, and a schedule value: ``(target,)``."""
+        known = jnp.concatenate([first, jnp.ones(1)])
+        if self.grid.shape[0] == 1:
+            parts = known @ self._rows(self.first), then @ self._rows(self.then)
+        else:
+            at = _place(self.grid, value)
+            parts = self._between(known, self.first, at), self._between(then, self.then, at)
+        return (parts[0] + parts[1])[: self.targets]
+
+    def _between(
+        self, inputs: jax.Array, table: jax.Array, at: tuple[jax.Array, jax.Array]
+    ) -> jax.Array:
+        """Inputs with the weights of two points times the coefficients there, as one product."""
+        (i, t), size = at, len(inputs) * self.filled
+        both = jax.lax.dynamic_slice(table, (i * size,), (2 * size,), allow_negative_indices=False)
+        return jnp.concatenate([(1 - t) * inputs, t * inputs]) @ self._rows(both)
+
+    def _rows(self, table: jax.Array) -> jax.Array:
+        return table.reshape(-1, self.filled)
+
+
+def _place(grid: jax.Array, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+    """Interval of the grid that a schedule value lies in, and where in it, 0 to 1."""
+    value = jnp.clip(value, grid[0], grid[-1])
+    i = jnp.clip(jnp.sum(value >= grid) - 1, 0, grid.shape[0] - 2)
+    ends = jax.lax.dynamic_slice_in_dim(grid, i, 2)
+    return i, (value - ends[0]) / (ends[1] - ends[0])

@@ -29,6 +29,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
 from dfsm.models.departures import Departure, departures, told
 from dfsm.models.dfsm import DFSM
+from dfsm.models.staged import staged
 from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_compiled
 from dfsm.simulation.loop_cases import (
@@ -277,7 +278,7 @@ class _Batch:
         cases = {
             i: prepared_cases(model, self.runs, i, self.window, settings) for i in set(intervals)
         }
-        ready, cores = model.stripped(), os.cpu_count() or 1
+        ready, cores = staged(model), os.cpu_count() or 1
         pairs = zip(wires, controllers, strict=True)
         rollers = [_roller(ready, its, controller, watched) for its, controller in pairs]
 

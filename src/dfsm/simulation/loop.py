@@ -217,7 +217,7 @@ def _checked(commands: Any, wires: Wires) -> jax.Array:
 def roll_compiled(model: DFSM, wires: Wires, controller: Any, drive: Drive) -> Path:
     """`roll`, compiled; models, controllers and runs of the same shapes share one compilation.
 
-    Fastest with a model that is `stripped`. The training range is not
+    Fastest with a model that is `staged`. The training range is not
     checked: that takes longer than the controller, and where figures are asked for nobody looks.
     """
     return roll(model.prepared(), wires, controller, drive)._replace(outside=None)

@@ -12,6 +12,7 @@ import numpy as np
 
 from dfsm.core.host import from_host
 from dfsm.models.corrective.form import Corrective
+from dfsm.numerics.exponential import exp
 
 
 class GaussianUnits(Corrective):
@@ -43,7 +44,7 @@ class GaussianUnits(Corrective):
         return ProductForm(self.shift, self.scale, matrix, self.weights, self.bias)
 
     def stripped(self) -> ProductForm:
-        """The prepared function without the inputs that have no effect."""
+        """The prepared function without the inputs that have no effect, as loops take it."""
         kept = np.flatnonzero(np.isfinite(np.asarray(self.scale)))
         parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
         spans = tuple((int(part[0]), int(part[-1]) + 1) for part in parts if len(part))
@@ -123,4 +124,5 @@ class ProductForm(eqx.Module):
             inputs = jnp.concatenate([inputs[first:end] for first, end in self.spans])
         z = (inputs - self.shift) / self.scale
         exponents = jnp.concatenate([z, jnp.ones(1), jnp.sum(z**2)[None]]) @ self.matrix
-        return self.weights @ jnp.exp(exponents) + self.bias
+        powers = jnp.exp(exponents) if self.spans is None else exp(exponents)
+        return self.weights @ powers + self.bias

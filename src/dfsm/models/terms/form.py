@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
@@ -57,6 +58,18 @@ class Term(eqx.Module):
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """The values at one input vector, shape ``(input,)`` to ``(value,)``."""
         return self.values(inputs[np.array(self.columns, dtype=int)])
+
+    def of_numbers(self, signals: Sequence[jax.Array]) -> jax.Array:
+        """The values of single numbers, one per signal; `values` but for the last digits.
+
+        What follows from some of them alone is computed from these alone: a compiler then does it
+        once where the others change.
+        """
+        return self.values(jnp.stack(signals))
+
+    def staged(self) -> Term:
+        """The term in the form in which `of_numbers` is fastest; it cannot be saved."""
+        return self
 
     # -- other terms made of it -----------------------------------------------------------------
 

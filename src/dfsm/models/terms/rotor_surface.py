@@ -92,13 +92,41 @@ def surface(
     pitch
         β in deg.
     """
-    cells = weights.shape[1] - 3
-    w = grid.stretch * wind
-    i, along = _basis((jnp.arctan2(w, tip_speed) / np.pi + 0.5) * cells, cells)
-    j, across = _basis((pitch - grid.pitch_start) / grid.pitch_step, weights.shape[2] - 3)
+    i, along = _basis(*_angle(weights.shape[1] - 3, grid, wind, tip_speed))
+    j, across = _basis(*_pitch(weights.shape[2] - 3, grid, pitch))
     patch = jax.lax.dynamic_slice(weights, (jnp.int32(0), i, j), (2, 4, 4))
     # Sums of products instead of small matrix products, which cost a call each.
     return jnp.sum(patch * (along[:, None] * across), axis=(1, 2))
+
+
+def surface_of_rows(
+    rows: jax.Array, grid: Grid, wind: jax.Array, tip_speed: jax.Array, pitch: jax.Array
+) -> jax.Array:
+    """`surface_values` of weights with both forces side by side, ``(cell + 3, pitch cell + 3, 2)``.
+
+    All that is read of a row lies together, which a processor takes at once.
+    """
+    cells, pitches, count = rows.shape
+    i, along = _basis(*_angle(cells - 3, grid, wind, tip_speed))
+    j, across = _basis(*_pitch(pitches - 3, grid, pitch))
+    flat, parts = rows.reshape(-1), []
+    for k in range(4):
+        first = ((i + k) * pitches + j) * count
+        part = jax.lax.dynamic_slice(flat, (first,), (4 * count,), allow_negative_indices=False)
+        parts.append(along[k] * part)
+    both = (parts[0] + parts[1] + parts[2] + parts[3]).reshape(4, count)
+    value = across[0] * both[0] + across[1] * both[1] + across[2] * both[2] + across[3] * both[3]
+    return value * ((grid.stretch * wind) ** 2 + tip_speed**2)
+
+
+def _angle(cells: int, grid: Grid, wind: jax.Array, tip_speed: jax.Array) -> tuple[jax.Array, int]:
+    """The inflow's angle in cells of the splines, and their number."""
+    return (jnp.arctan2(grid.stretch * wind, tip_speed) / np.pi + 0.5) * cells, cells
+
+
+def _pitch(cells: int, grid: Grid, pitch: jax.Array) -> tuple[jax.Array, int]:
+    """The blade pitch in cells of the splines, and their number."""
+    return (pitch - grid.pitch_start) / grid.pitch_step, cells
 
 
 def _basis(at: jax.Array, cells: int) -> tuple[jax.Array, jax.Array]:

@@ -125,16 +125,29 @@ class RotorTerm(Term):
 
         With a lag the rate of the induced velocity in m/s² is the last of three.
         """
-        wind, speed, pitch = self.inflow(signals)
+        induced = signals[self._induced] if self.about.lags else None
+        return self.felt(self.inflow(signals), induced)
+
+    def felt(
+        self, inflow: tuple[jax.Array, jax.Array, jax.Array], induced: jax.Array | None
+    ) -> jax.Array:
+        """The values at what `inflow` tells, and the induced velocity if it lags."""
+        wind, speed, pitch = inflow
         # No direction of the inflow is lost: only its angle is asked of the spline.
         tips = jnp.sqrt(speed**2 + _CALM**2)
-        if not self.about.lags:
+        if induced is None:
             return self._forces(wind, tips, pitch)
-        induced, slope = settled(self.induction, self.grid, wind, tips, pitch)
-        missing = induced - signals[self._induced]
-        rate = missing / lag(self.about.radius, wind, tips, induced, self.pace)
+        still, slope = settled(self.induction, self.grid, wind, tips, pitch)
+        missing = still - induced
+        rate = missing / lag(self.about.radius, wind, tips, still, self.pace)
         seen = wind_of_inflow(wind, tips, missing, slope, self.pace)
         return jnp.append(self._forces(seen, tips, pitch), rate)
+
+    def staged(self) -> Term:
+        """See `Term.staged`."""
+        from dfsm.models.terms.rotor_staged import staged_rotor
+
+        return staged_rotor(self)
 
     def wake(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Settled induced velocity in m/s and the lag in s, ``(input,)`` to numbers."""
@@ -144,10 +157,13 @@ class RotorTerm(Term):
         return induced, lag(self.about.radius, wind, tips, induced, self.pace)
 
     def _forces(self, wind: jax.Array, tips: jax.Array, pitch: jax.Array) -> jax.Array:
-        forces = surface_values(self.weights, self.grid, wind, tips, pitch)
-        forces = forces * self.factors(wind, tips, pitch)
+        forces = self.surface(wind, tips, pitch) * self.factors(wind, tips, pitch)
         size = 0.5e-3 * self.about.density * np.pi * self.about.radius**2
         return forces * np.array([size, size * self.about.radius])
+
+    def surface(self, wind: jax.Array, tips: jax.Array, pitch: jax.Array) -> jax.Array:
+        """See `surface_values`."""
+        return surface_values(self.weights, self.grid, wind, tips, pitch)
 
     def factors(self, wind: jax.Array, tips: jax.Array, pitch: jax.Array) -> jax.Array:
         """What thrust and torque of the table are multiplied by, ``(2,)``.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -53,6 +53,15 @@ class Terms(eqx.Module):
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """The values at one input vector, shape ``(input,)`` to ``(value,)``."""
         return jnp.concatenate([part(inputs) for part in self.parts] or [jnp.zeros(0)])
+
+    def apart(self, number: Callable[[int], jax.Array]) -> jax.Array:
+        """The values where `number` gives single inputs by column, see `Term.of_numbers`."""
+        parts = [part.of_numbers([number(i) for i in part.columns]) for part in self.parts]
+        return jnp.concatenate(parts or [jnp.zeros(0)])
+
+    def staged(self) -> Terms:
+        """The same terms as loops take them; they cannot be saved."""
+        return replace(self, parts=tuple(part.staged() for part in self.parts))
 
     def extend(self, inputs: jax.Array) -> jax.Array:
         """[I, φ(I)], shape ``(input,)`` to ``(input + value,)``."""
