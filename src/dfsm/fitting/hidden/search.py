@@ -42,6 +42,8 @@ _WORTH_A_SENSOR = 0.7
 # Linear systems whose squared error is no more than so many times the least may be enough.
 _NEARLY = 2.0
 _MOST_STEPS = 8
+# The polynomial and some draws of tanh units go first.
+_SCOUTS = 4
 _MOST_MONOMIALS = 60
 # Polynomials go on to so many times what was recorded.
 _BEYOND = 1.5
@@ -184,23 +186,36 @@ def _ascended(
     """The best of all, from few hidden states to more, until one more is not worth it.
 
     What is nonlinear looks like further states to a linear system: it only tells where to begin.
+    Few draws tell how many there are, and whether the others are worth drawing.
     """
     best, tried = None, []
     for count in _promising(linear):
-        candidates = list(_nonlinear(linear[count], windows, settings, seed))
+        tasks = _forms(linear[count].form, windows, settings, seed)
+        candidates = list(_nonlinear(linear[count], windows, settings, tasks[:_SCOUTS]))
         tried += [(c.form.kind, count, c.error) for c in candidates]
         # Where all run away, the linear one stays.
-        first = min([*candidates, linear[count]], key=lambda c: c.error)
+        first = min([*candidates, linear[count]], key=_error)
         if best is not None and first.error > _WORTH_A_STATE * best.error:
             break
-        best = first
+        best, others = first, (linear[count], candidates, tasks[_SCOUTS:])
     if best is None:
         raise ValueError("no number of hidden states to try")
+    start, scouts, tasks = others
+    least = min((c.error for c in scouts if c.form.kind == "tanh"), default=np.inf)
+    if least <= _NEARLY * best.error:
+        more = list(_nonlinear(start, windows, settings, tasks))
+        count = start.form.states - start.form.outputs
+        tried += [(c.form.kind, count, c.error) for c in more]
+        best = min([best, *more], key=_error)
     return best, tried
 
 
+def _error(candidate: Candidate) -> float:
+    return candidate.error
+
+
 def _nonlinear(
-    linear: Candidate, windows: Windows, settings: HiddenSettings, seed: int
+    linear: Candidate, windows: Windows, settings: HiddenSettings, tasks: list[tuple[Form, int]]
 ) -> Iterable[Candidate]:
     """Candidates from one linear system, several at a time."""
 
@@ -211,7 +226,7 @@ def _nonlinear(
         return replace(found, error=np.inf) if runs_away(found, windows) else found
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        yield from pool.map(one, _forms(linear.form, windows, settings, seed))
+        yield from pool.map(one, tasks)
 
 
 def _forms(

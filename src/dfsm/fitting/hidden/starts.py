@@ -141,7 +141,8 @@ def improved(form: Form, windows: Windows, weights: Array, decay: float, limit: 
     stage, count = -(-limit // _STAGES), 0
     for _ in range(_STAGES):
         # What the errors are decides what a parameter of one may cost.
-        weighed = HiddenError(form, windows, decay * error.trained(last) * form.weighed)
+        trained = error.trained(last)
+        weighed = HiddenError(form, windows, decay * trained * form.weighed)
         for step in islice(LevenbergMarquardt(weighed, Step(last), 0.0), stage):
             count, last = count + 1, step.weights
             if 2 * count >= limit and (now := on_left_out(last)) <= least:
