@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dfsm.config.proposal import propose
 from dfsm.data.derivatives import StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.exports.python_model import write_python
@@ -82,7 +83,12 @@ def test_signs_come_back() -> None:
 
 def test_inputs_drive_what_has_lost_its_sign() -> None:
     """As much one way as the other, so that no past of u tells |x| by itself."""
-    assert driven_by_past(record(1, NOISE), ["u", "y"]) == ["y"]
+    run = record(1, NOISE)
+    assert driven_by_past(run, ["u", "y"]) == ["y"]
+    proposed = propose([run], ["u", "y"], [])
+    assert proposed.hidden
+    assert "as absolute values do" in proposed.reasons["y"]
+    assert "absolute" not in proposed.reasons["u"]
 
 
 @pytest.mark.filterwarnings("ignore:.*outside the training range")

@@ -17,7 +17,7 @@ from dfsm.core.types import Array
 from dfsm.data.between import recognised
 from dfsm.data.derivatives import per_second
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.fitting.causes import driven_by_past
+from dfsm.fitting.causes import driven_by_past, lost_its_sign
 
 # What wind engineers usually choose; only names that exist are proposed. The rate of a rotor's
 # speed is none of its states: nothing that is recorded explains how it changes.
@@ -201,6 +201,8 @@ def _with_hidden(
     for name in names:
         if name in driven:
             reasons[name] = "state, with hidden ones beside it: the past of the others drives it"
+            if lost_its_sign(run, name, names):
+                reasons[name] += "; it touches an end with kinks, as absolute values do"
         elif np.mean(np.diff(run[name]) == 0) > 1 / 2:
             controls.append(name)
             reasons[name] = "control: it stays and jumps, and no past of the others explains it"

@@ -45,13 +45,19 @@ def _with_signs(table: Array) -> Array:
 
     What drives x as much one way as the other tells nothing of |x|.
     """
-    table = table.copy()
-    for i in range(table.shape[1]):
-        others = np.delete(table, i, axis=1)
-        found = unfolded([(others, table[:, i])])
-        if found is not None and found.clear:
-            table[:, i] = found.paths[0]
-    return table
+    return np.column_stack([_with_sign(table, i) for i in range(table.shape[1])])
+
+
+def _with_sign(table: Array, column: int) -> Array:
+    """One channel with its sign, or as it is."""
+    found = unfolded([(np.delete(table, column, axis=1), table[:, column])])
+    return found.paths[0] if found is not None and found.clear else table[:, column]
+
+
+def lost_its_sign(run: Trajectory, name: str, names: Sequence[str]) -> bool:
+    """Whether a channel, of some that may drive it, looks like an absolute value."""
+    table = np.nan_to_num(run.select(names).values[:_SIGNED])
+    return bool((_with_sign(table, names.index(name)) != table[:, names.index(name)]).any())
 
 
 def _driven(table: Array, names: Sequence[str]) -> list[str]:
