@@ -188,7 +188,7 @@ def _ascended(
     What is nonlinear looks like further states to a linear system: it only tells where to begin.
     Few draws tell how many there are, and whether the others are worth drawing.
     """
-    best, tried = None, []
+    best, others, tried = None, None, []
     for count in _promising(linear):
         tasks = _forms(linear[count].form, windows, settings, seed)
         candidates = list(_nonlinear(linear[count], windows, settings, tasks[:_SCOUTS]))
@@ -198,7 +198,7 @@ def _ascended(
         if best is not None and first.error > _WORTH_A_STATE * best.error:
             break
         best, others = first, (linear[count], candidates, tasks[_SCOUTS:])
-    if best is None:
+    if best is None or others is None:
         raise ValueError("no number of hidden states to try")
     start, scouts, tasks = others
     least = min((c.error for c in scouts if c.form.kind == "tanh"), default=np.inf)
