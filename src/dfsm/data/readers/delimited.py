@@ -83,7 +83,7 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
         raise DfsmError(f"{path} holds blank lines only: check that it is the right file")
     rows, commas = with_points(path, _rows(path, lines, header), header.separator)
     channels = named_channels([unguarded(cell) for cell in header.names])
-    labels = rows[: count_labels(rows, channels)]
+    labels = rows[: count_labels(rows)]
     units, words = label_rows(labels, lines, header.at, channels, header.separator == _BLANKS)
     if units:
         channels = [Channel(c.name, c.unit or u) for c, u in zip(channels, units, strict=True)]

@@ -43,12 +43,12 @@ def named_channels(cells: Sequence[str]) -> list[Channel]:
     ]
 
 
-def count_labels(rows: Sequence[Row], channels: Sequence[Channel]) -> int:
+def count_labels(rows: Sequence[Row]) -> int:
     """How many rows at the head of a table hold words alone; 0 where all do."""
     for count, row in enumerate(rows[: _MOST + 1]):
         if any(c.strip() and (number(c) is not None or is_stamp(c)) for c in row.cells):
             return count
-    return 0 if channels else len(rows)
+    return 0
 
 
 def label_rows(
