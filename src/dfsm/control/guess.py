@@ -12,6 +12,7 @@ from dfsm.core.types import Array
 from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
+from dfsm.numerics.hats import hat_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +48,10 @@ def start_of(
     problem
         To solve.
     guess
-        None draws straight lines between the ends. A run gives the states and controls that it
-        holds, stretched over the horizon (and the last time, if that is free); the others are
-        straight lines. A solution gives all.
+        None draws straight lines between the ends, or through what the training runs of a surrogate
+        did, where the schedule is as in the mean over the horizon. A run gives the states and
+        controls that it holds, stretched over the horizon (and the last time, if that is free);
+        the others are straight lines. A solution gives all.
     tau
         Normalised times of the nodes, shape ``(node,)``.
     """
@@ -117,9 +119,7 @@ def _stop(problem: OptimalControlProblem, guess: Solution | Trajectory | None) -
 
 def _straight(problem: OptimalControlProblem, time: Array, tau: Array) -> tuple[Array, Array]:
     plant = problem.plant
-    usual = dict.fromkeys((*plant.names("states"), *plant.names("controls")), 0.0)
-    if plant.region is not None:
-        usual |= dict(zip(plant.order.names, np.asarray(plant.region.mean), strict=True))
+    usual = _usual(problem, time)
     ends = time[[0, -1]]
     X = []
     for name in plant.names("states"):
@@ -131,7 +131,9 @@ def _straight(problem: OptimalControlProblem, time: Array, tau: Array) -> tuple[
             pair = (max(lo, below), min(hi, above))
             values.append(_near(usual[name], *pair) if named else None)
         first, last = values
-        rest = [_near(usual[name], lo, hi) for lo, hi in zip(low, high, strict=True)]
+        # Where nobody knows what is usual, the middle of closed bounds is.
+        near = _near if plant.region is None else _clipped
+        rest = [near(usual[name], lo, hi) for lo, hi in zip(low, high, strict=True)]
         first = (rest[0] if last is None else last) if first is None else first
         last = first if last is None else last
         X.append(first + tau * (last - first))
@@ -145,13 +147,31 @@ def _straight(problem: OptimalControlProblem, time: Array, tau: Array) -> tuple[
     return _columns(X, len(tau)), _columns(U, len(tau))
 
 
+def _usual(problem: OptimalControlProblem, time: Array) -> dict[str, float]:
+    """States and controls of the training runs, where they are scheduled: in wind like this."""
+    plant = problem.plant
+    region, run = plant.region, problem.scenarios[0]
+    if region is None:
+        return dict.fromkeys((*plant.names("states"), *plant.names("controls")), 0.0)
+    names, values = plant.order.names, np.asarray(region.mean)
+    if run is not None and region.schedule is not None and names[region.schedule] in run:
+        signal = np.interp(time, run.time, run[names[region.schedule]])
+        (shares,) = hat_weights(np.asarray(region.grid), np.array([np.mean(signal)]))
+        values = shares @ np.asarray(region.operating)
+    return dict(zip(names, values.tolist(), strict=True))
+
+
 def _columns(channels: list[Array], count: int) -> Array:
     return np.stack(channels, axis=1) if channels else np.empty((count, 0))
 
 
 def _near(value: float, low: float, high: float) -> float:
     """The middle of a closed interval, else what is nearest to a value."""
-    return _middle((low, high)) if np.isfinite(high - low) else float(np.clip(value, low, high))
+    return _middle((low, high)) if np.isfinite(high - low) else _clipped(value, low, high)
+
+
+def _clipped(value: float, low: float, high: float) -> float:
+    return float(np.clip(value, low, high))
 
 
 def _middle(level: float | tuple[float, float]) -> float:
