@@ -202,11 +202,11 @@ def _toa5(run: Trajectory) -> bytes:
     return "\n".join([*lines, ""]).encode()
 
 
-def wind_field() -> bytes:
-    """A small TurbSim field."""
-    codes = np.random.default_rng(0).integers(-3000, 3000, (40, 3 * 16)).astype("<i2")
-    head = struct.pack("<h4i", 7, 4, 4, 0, 40)
-    head += struct.pack("<6f", 10.0, 10.0, 0.1, 10.0, 90.0, 75.0)
+def wind_field(points: int = 4) -> bytes:
+    """A small TurbSim field, 30 m wide and high, of so many points in either direction."""
+    codes = np.random.default_rng(0).integers(-3000, 3000, (40, 3 * points**2)).astype("<i2")
+    head, apart = struct.pack("<h4i", 7, points, points, 0, 40), 30 / (points - 1)
+    head += struct.pack("<6f", apart, apart, 0.1, 10.0, 90.0, 75.0)
     head += struct.pack("<6fi", 1000.0, -10000.0, 1000.0, 0.0, 1000.0, 0.0, 4) + b"made"
     return head + codes.tobytes()
 

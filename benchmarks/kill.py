@@ -228,7 +228,7 @@ def run() -> dict[str, Any]:
         "o.parquet": ("simulate", "model", "test.csv", "-o", "o.parquet", "-q"),
         "i.json": ("calibrate", "model", "held/*", "-o", "i.json", "-q"),
         "s": ("optimize", "problem.yaml", "-o", "s", "-q"),
-        "c": ("export-rosco", "solution", "-o", "c"),
+        "c": ("export-rosco", "solution", "--torque", "Torque", "-o", "c"),
         "w": ("wind", "field.bts", "train/a.csv", "--radius", "12", "-o", "w", "-q"),
         "all": ("compare", "config.yaml", "-o", "all", "--jobs", "1", "-q"),
     }
@@ -272,7 +272,7 @@ def _prepare(source: Path) -> None:
     for k, name in enumerate(("train/a", "train/b", "train/c", "held/d", "held/e", "held/f")):
         write_table(_oscillator(k), source / f"{name}.csv")
     write_table(_oscillator(9), source / "test.csv")
-    (source / "field.bts").write_bytes(wind_field())
+    (source / "field.bts").write_bytes(wind_field(7))
     (source / "config.yaml").write_text(_CONFIG)
     (source / "problem.yaml").write_text(_PROBLEM)
     for arguments in (
