@@ -17,9 +17,9 @@ PAGE = ROOT / "docs" / "results" / "floating-turbine-control.md"
 
 def main() -> None:
     """Turn the example's tables into Markdown."""
-    tables = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    written = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     tables = {}
-    for key, rows in tables.items():
+    for key, rows in written.items():
         columns = tuple(rows[0])
         cells = tuple(tuple(row[c] for c in columns) for row in rows)
         tables[key] = Table(

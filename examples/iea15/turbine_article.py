@@ -54,6 +54,8 @@ _HEADS = (
     "time (s)",
     "replay (deg)",
 )
+# Share of the power below which a limit of the platform pitch is said to cost nothing.
+_LEAST_COST = 5e-4
 CLAIMS = (
     "Θp peaks near w = 11 m/s",
     "lower Θp,max: β more active",
@@ -109,9 +111,10 @@ def answer_section(study: ControlStudy) -> Section:
         panel.append(Curve(_short(name), np.array(limits), np.array(power), len(panel) + 1))
         if variant == "b" and len(kept) > 1:
             cost = 1 - power[0] / power[-1]
+            told = f"{cost:.1%} less" if cost >= _LEAST_COST else "as much"
             sentences.append(
-                f"{_short(name)}: {power[-1]:.2f} MW with Θp,max = {limits[-1]:g} deg, and "
-                f"{cost:.1%} less with {limits[0]:g} deg."
+                f"{_short(name)}: {power[-1]:.2f} MW with Θp,max = {limits[-1]:g} deg, and {told} "
+                f"with {limits[0]:g} deg."
             )
     most = 1.1 * max((r.power for r in solved), default=1.0)
     figure = Figure(
