@@ -229,7 +229,7 @@ def run() -> dict[str, Any]:
         "i.json": ("calibrate", "model", "held/*", "-o", "i.json", "-q"),
         "s": ("optimize", "problem.yaml", "-o", "s", "-q"),
         "c": ("export-rosco", "solution", "--torque", "Torque", "-o", "c"),
-        "w": ("wind", "field.bts", "train/a.csv", "--radius", "12", "-o", "w", "-q"),
+        "w/calm.parquet": ("wind", "field.bts", "calm.csv", "--radius", "12", "-o", "w", "-q"),
         "all": ("compare", "config.yaml", "-o", "all", "--jobs", "1", "-q"),
     }
     figures: dict[str, Any] = {}
@@ -272,6 +272,7 @@ def _prepare(source: Path) -> None:
     for k, name in enumerate(("train/a", "train/b", "train/c", "held/d", "held/e", "held/f")):
         write_table(_oscillator(k), source / f"{name}.csv")
     write_table(_oscillator(9), source / "test.csv")
+    write_table(_oscillator(9).select(["q", "Torque", "y"]).window(0, 2), source / "calm.csv")
     (source / "field.bts").write_bytes(wind_field(7))
     (source / "config.yaml").write_text(_CONFIG)
     (source / "problem.yaml").write_text(_PROBLEM)
