@@ -230,7 +230,7 @@ def run() -> dict[str, Any]:
         "s": ("optimize", "problem.yaml", "-o", "s", "-q"),
         "c": ("export-rosco", "solution", "--torque", "Torque", "-o", "c"),
         "w/calm.parquet": ("wind", "field.bts", "calm.csv", "--radius", "12", "-o", "w", "-q"),
-        "all": ("compare", "config.yaml", "-o", "all", "--jobs", "1", "-q"),
+        "all/raw": ("compare", "config.yaml", "-o", "all", "--jobs", "1", "-q"),
     }
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as base:
