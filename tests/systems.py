@@ -17,6 +17,8 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.region import Region
 from dfsm.models.signals import Azimuth, SignalTable
+from dfsm.refinement.growth import StabilityKept
+from dfsm.refinement.rollout_error import RolloutError
 
 Signal = Callable[[np.ndarray], np.ndarray]
 Right = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -216,3 +218,12 @@ def driving_run(
         name=name,
         source=f"runs/{name}.csv",
     )
+
+
+def cost_slopes(
+    problem: RolloutError | StabilityKept, at: np.ndarray, eps: float = 1e-6
+) -> list[float]:
+    """Central differences of a cost of refinement in every parameter."""
+    eps = 1e-6
+    steps = eps * np.eye(at.size)
+    return [(problem.cost(at + d) - problem.cost(at - d)) / (2 * eps) for d in steps]

@@ -23,7 +23,7 @@ from dfsm.models.terms import RotorTerm
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
 from dfsm.refinement.start import start_latents
-from systems import wander
+from systems import cost_slopes, wander
 
 TABLE = dfsm.read_rotor_table(
     Path(__file__).parents[1] / "examples" / "iea15" / "Cp_Ct_Cq.IEA15MW.txt"
@@ -257,9 +257,7 @@ def test_slopes_agree_with_differences(model, runs, length):
     problem = RolloutError(parameters, [[record]], length, ErrorWeights(np.ones(1)))
     at = 0.003 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)
-    eps, slopes = 1e-6, []
-    for d in eps * np.eye(parameters.size):
-        slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
+    slopes = cost_slopes(problem, at)
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-4, atol=1e-5 * np.abs(slopes).max())
 
 

@@ -22,7 +22,7 @@ from dfsm.errors import DfsmError, hushed
 from dfsm.refinement.parameters import Parametrization
 from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
 from dfsm.refinement.start import start_latents
-from systems import wander
+from systems import cost_slopes, wander
 
 TABLE = Path(__file__).parents[1] / "examples" / "iea15" / "Cp_Ct_Cq.IEA15MW.txt"
 TIME = np.arange(0, 60.01, 0.05)
@@ -305,9 +305,7 @@ def test_slopes_through_terms_agree_with_differences(started, remembering, turbi
     problem = RolloutError(parameters, [[record]], 50.0, ErrorWeights(np.ones(3)))
     at = 0.003 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)
-    eps, slopes = 1e-6, []
-    for d in eps * np.eye(parameters.size):
-        slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
+    slopes = cost_slopes(problem, at)
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-4, atol=1e-5 * np.abs(slopes).max())
 
 

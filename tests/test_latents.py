@@ -33,7 +33,7 @@ from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
 from dfsm.refinement.settings import RefineSettings
 from dfsm.simulation.simulate import Status, initial_state, simulate
 from dfsm.validation.validate import compared, validate
-from systems import DUFFING, wander
+from systems import DUFFING, cost_slopes, wander
 
 TIME = np.arange(0, 60.01, 0.1)
 START = 20.0
@@ -243,9 +243,7 @@ def test_sensitivities_agree_with_differences(model, runs, length):
     problem = RolloutError(parameters, [[record]], length, ErrorWeights(np.ones(1)))
     at = 0.01 * np.random.default_rng(0).normal(size=parameters.size)
     _, Jtr = problem.normal_equations(at)
-    eps, slopes = 1e-6, []
-    for d in eps * np.eye(parameters.size):
-        slopes.append((problem.cost(at + d) - problem.cost(at - d)) / (2 * eps))
+    slopes = cost_slopes(problem, at)
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-5, atol=1e-7)
 
 

@@ -12,7 +12,6 @@ from dfsm.core.types import Array
 from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.numerics.hats import hat_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +155,7 @@ def _usual(problem: OptimalControlProblem, time: Array) -> dict[str, float]:
     names, values = plant.order.names, np.asarray(region.mean)
     if run is not None and region.schedule is not None and names[region.schedule] in run:
         signal = np.interp(time, run.time, run[names[region.schedule]])
-        (shares,) = hat_weights(np.asarray(region.grid), np.array([np.mean(signal)]))
-        values = shares @ np.asarray(region.operating)
+        (values,) = region.usual(np.array([np.mean(signal)]))
     return dict(zip(names, values.tolist(), strict=True))
 
 

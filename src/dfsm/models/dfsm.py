@@ -296,9 +296,8 @@ class DFSM(eqx.Module):
         A = L[:, :, columns]
         if self.terms is None:
             return A
-        n, grid = len(self.signals.inputs), np.asarray(self.region.grid)
-        middles = [np.interp(self.f.grid, grid, v) for v in np.asarray(self.region.operating).T]
-        slopes = self.terms.slopes(np.stack(middles, axis=1))[:, :, columns]
+        n, middles = len(self.signals.inputs), self.region.usual(np.asarray(self.f.grid))
+        slopes = self.terms.slopes(middles)[:, :, columns]
         return A + L[:, :, n:] @ slopes
 
     def eigenvalues(self) -> list[tuple[float, ComplexArray]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dfsm.core.host import from_host, traced
+from dfsm.core.types import Array
 from dfsm.numerics.hats import hats
 
 
@@ -70,6 +71,14 @@ class Region(eqx.Module):
         parts = {n: fewer(getattr(self, n)) for n in ("low", "high", "mean", "std", "operating")}
         whitening = fewer(self.whitening) if self.whitening.size else self.whitening
         return replace(self, **parts, whitening=whitening)
+
+    def usual(self, values: Array) -> Array:
+        """Mean inputs of the training data where the schedule has values ``(value,)``.
+
+        Beyond the outermost operating points, those; shape ``(value, input)``.
+        """
+        grid, operating = np.asarray(self.grid), np.asarray(self.operating)
+        return np.stack([np.interp(values, grid, column) for column in operating.T], axis=1)
 
     @property
     def scale(self) -> jax.Array:

@@ -59,8 +59,7 @@ def wakes_where(model: DFSM, known: Mapping[str, float]) -> Array:
     names = [c.name for c in s.inputs]
     inputs = np.array(region.mean)
     if column is not None and (value := known.get(names[column])) is not None:
-        points = np.asarray(region.operating).T
-        inputs = np.array([np.interp(value, region.grid, row) for row in points])
+        inputs = region.usual(np.array([value]))[0]
     for k, name in enumerate(names):
         inputs[k] = known.get(name, inputs[k])
     return np.asarray(settled_wakes(model, jnp.asarray(inputs)))[s.induced_columns]

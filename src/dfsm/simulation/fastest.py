@@ -15,7 +15,6 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
-from dfsm.models.region import Region
 
 # Largest h |λ|: half of what is stable, where a mode is still followed and over in a few steps.
 REACH = 1.5
@@ -77,7 +76,7 @@ def _matrices(model: DFSM, inputs: Array) -> Array:
         size = next((n for n in _AT_ONCE if n >= len(at)), _AT_ONCE[-1])
         now, at = at[:size], at[size:]
         wide = np.concatenate([now, np.repeat(now[-1:], size - len(now), axis=0)])
-        x = _usual(model.region, wide)[:, s.state_columns]
+        x = model.region.usual(wide[:, model.region.schedule or 0])[:, s.state_columns]
         u, w, p = (wide[:, s.order.columns(g)] for g in ("controls", "disturbances", "parameters"))
         parts.append(np.asarray(_state_matrices(model, x, u, w, p))[: len(now)])
     return np.concatenate(parts)
@@ -92,13 +91,6 @@ def _linear_fits(f: LinearModel, value: Array) -> Array:
     i = np.clip(np.searchsorted(grid, value, side="right") - 1, 0, len(grid) - 2)
     t = ((value - grid[i]) / (grid[i + 1] - grid[i]))[:, None, None]
     return (1 - t) * L[i] + t * L[i + 1]
-
-
-def _usual(region: Region, inputs: Array) -> Array:
-    """Mean inputs of the training data at the schedule of some, ``(place, input)``."""
-    grid, operating = np.asarray(region.grid), np.asarray(region.operating)
-    value = inputs[:, region.schedule or 0]
-    return np.stack([np.interp(value, grid, column) for column in operating.T], axis=1)
 
 
 @eqx.filter_jit

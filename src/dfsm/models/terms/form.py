@@ -144,9 +144,9 @@ class Term(eqx.Module):
     def structure(self) -> dict[str, Any]:
         """What a manifest keeps besides `kind`, `columns` and `channels`: JSON values."""
 
-    @abstractmethod
     def arrays(self) -> dict[str, jax.Array]:
-        """What is kept in arrays, by name."""
+        """What is kept in arrays, by name; nothing unless a term says otherwise."""
+        return {}
 
     @classmethod
     @abstractmethod

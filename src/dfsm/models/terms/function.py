@@ -96,10 +96,6 @@ class FunctionTerm(Term):
         """The name by which the function is passed when the model is read again."""
         return {"function": self.channels[0].name}
 
-    def arrays(self) -> dict[str, jax.Array]:
-        """None."""
-        return {}
-
     @classmethod
     def restored(
         cls,

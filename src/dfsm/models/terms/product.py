@@ -93,10 +93,6 @@ class ProductTerm(Term):
         """Nothing."""
         return {}
 
-    def arrays(self) -> dict[str, jax.Array]:
-        """None."""
-        return {}
-
     @classmethod
     def restored(
         cls,

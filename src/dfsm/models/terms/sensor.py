@@ -76,10 +76,6 @@ class SensorTerm(Term):
         told = self.sensor._asdict()
         return {k: v for k, v in told.items() if not (isinstance(v, float) and math.isinf(v))}
 
-    def arrays(self) -> dict[str, jax.Array]:
-        """None."""
-        return {}
-
     @classmethod
     def restored(
         cls,
