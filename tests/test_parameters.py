@@ -19,6 +19,7 @@ from dfsm import cli
 from dfsm.config.fit import parse_config
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
+from dfsm.models.latents import Poles, add_latents
 from dfsm.simulators.two_link_robot import holding_torques
 from systems import SPRING
 
@@ -244,6 +245,16 @@ def test_a_linear_fit_may_be_scheduled_by_a_parameter(springs, points):
     for k in (3.5, 4.5, 5.0):
         A = model.jacobians([0.0, 0.0], [0.0], (), [k])[0]
         np.testing.assert_allclose(A, [[0, 1], [-k, -0.8]], rtol=0, atol={3: 0.25, 9: 0.01}[points])
+    # The parameter stands behind the states, and moves when these become more.
+    pair = Poles(*np.array([[0.1], [0.0]]), np.full((1, 1), 1.0 + 0j), np.zeros(1))
+    wide = add_latents(model, pair, np.zeros((2, 2)), [np.eye(9, 2)])
+    inputs = np.asarray(model.region.operating)[1:]
+    wider = np.insert(inputs, [3, 3], 0.2, axis=1)
+    expected = np.asarray(model.region.distance(inputs + 0.1))
+    np.testing.assert_allclose(
+        np.asarray(wide.region.distance(wider + 0.1)), expected, rtol=1e-12, atol=1e-12
+    )
+    assert expected.max() > 0.01
 
 
 # -- the command line ---------------------------------------------------------------------------

@@ -72,7 +72,12 @@ def _equal_bins(schedule: Array, weights: Array | None) -> NDArray[np.int8]:
         shares = np.arange(1, _OPERATING_POINTS) / _OPERATING_POINTS
         parts = np.split(ranks, np.searchsorted(ends, shares * ends[-1]))
     bins = np.zeros(len(schedule), dtype=np.int8)
-    for place, rows in enumerate(rows for rows in parts if len(rows)):
+    place, only = -1, None
+    for rows in (rows for rows in parts if len(rows)):
+        first, last = schedule[rows[[0, -1]]]
+        # Bins of one value, as a parameter has it in many runs, are one operating point.
+        place += first != last or first != only
+        only = first if first == last else None
         bins[rows] = place
     return bins
 

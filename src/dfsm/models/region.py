@@ -70,7 +70,10 @@ class Region(eqx.Module):
 
         parts = {n: fewer(getattr(self, n)) for n in ("low", "high", "mean", "std", "operating")}
         whitening = fewer(self.whitening) if self.whitening.size else self.whitening
-        return replace(self, **parts, whitening=whitening)
+        schedule = self.schedule
+        if schedule is not None:
+            schedule -= sum(column < schedule for column in columns)
+        return replace(self, **parts, whitening=whitening, schedule=schedule)
 
     def usual(self, values: Array) -> Array:
         """Mean inputs of the training data where the schedule has values ``(value,)``.

@@ -71,6 +71,9 @@ def with_range(region: Region, gone: slice, paths: Sequence[Array]) -> Region:
     """Ranges and moments of the inputs with those of some columns replaced."""
     z, W = np.concatenate(paths), region.whitening
     place = np.full(z.shape[1], gone.start)
+    schedule = region.schedule
+    if schedule is not None and schedule >= gone.stop:
+        schedule += len(place) - (gone.stop - gone.start)
 
     def put(values: jax.Array, new: Array) -> jax.Array:
         kept = np.delete(np.asarray(values), gone, axis=-1)
@@ -85,4 +88,5 @@ def with_range(region: Region, gone: slice, paths: Sequence[Array]) -> Region:
         operating=put(region.operating, np.tile(z.mean(axis=0), (len(region.grid), 1))),
         # Latent states follow from what was counted already: they add no distance.
         whitening=put(W, np.zeros(len(place))) if W.size else W,
+        schedule=schedule,
     )
