@@ -6,8 +6,10 @@ import enum
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dfsm.core.host import from_host
 from dfsm.core.types import Array
@@ -15,6 +17,8 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmWarning, printable
 from dfsm.models.departures import Departure, departures, told
 from dfsm.models.dfsm import DFSM
+from dfsm.models.region import Region
+from dfsm.models.signals import SignalTable
 from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.integrate import Rollout
@@ -42,6 +46,37 @@ class Status(enum.Enum):
     )
 
 
+@dataclass(frozen=True, eq=False)
+class StrayedPath:
+    """A path that left the training range; how takes ten times as long to say as that it did.
+
+    Attributes
+    ----------
+    region, signals
+        Of the model.
+    driven
+        Its inputs.
+    states
+        At the first of their samples, ``(time, state)``.
+    outside
+        Which of these samples are outside the training range, ``(time,)``.
+    """
+
+    region: Region
+    signals: SignalTable
+    driven: Trajectory
+    states: Array
+    outside: NDArray[np.bool_]
+
+    def departures(self) -> tuple[Departure, ...]:
+        """Where it left the training range, those that lasted longest first."""
+        s, end = self.signals, len(self.states)
+        exogenous = s.order.split_exogenous(from_host(self.driven.values[:end]))
+        inputs = np.asarray(s.order.join(from_host(self.states), *exogenous))
+        time = self.driven.time[:end]
+        return departures(self.region, s.inputs, time, inputs, self.outside, _weights(time))
+
+
 @dataclass(frozen=True)
 class Simulation(DrawnRun):
     """A rollout.
@@ -62,10 +97,10 @@ class Simulation(DrawnRun):
         Seconds it took (of the whole batch divided by its runs), without compilation when warm.
     note
         What was done otherwise than asked for: shorter steps, or another method; else "".
-    departures
-        Where it left the training range, those that lasted longest first.
     distance
         From the training data at every sample, ``(time,)``: 1 is as far as is usual.
+    strayed
+        The path by which it left the training range; None where it did not.
     """
 
     trajectory: Trajectory
@@ -75,8 +110,8 @@ class Simulation(DrawnRun):
     outside: float
     wall_time: float = 0.0
     note: str = ""
-    departures: tuple[Departure, ...] = ()
     distance: Array = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+    strayed: StrayedPath | None = field(default=None, repr=False, compare=False)
 
     def __repr__(self) -> str:
         run, outcome = self.trajectory, self.status.name.lower().replace("_", " ")
@@ -84,6 +119,11 @@ class Simulation(DrawnRun):
             f"<Simulation of {printable(run.name)}: {outcome}, {run.time[0]:g} to "
             f"{self.ended:g} s, {len(run)} samples; {printable(self.message)}>"
         )
+
+    @cached_property
+    def departures(self) -> tuple[Departure, ...]:
+        """Where it left the training range, those that lasted longest first."""
+        return () if self.strayed is None else self.strayed.departures()
 
     @property
     def message(self) -> str:
@@ -134,21 +174,21 @@ def judge(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) ->
     values = np.concatenate([x, rollout.outputs], axis=1)[: max(2, end)]
     values[end:] = np.nan  # a trajectory has two samples, even if the first step failed
     channels = (*s.states, *s.outputs)
-    time = driven.time[: len(values)]
-    left, weights = rollout.outside[:end], _weights(driven.time[:end])
-    seen: tuple[Departure, ...] = ()
+    trajectory = Trajectory(
+        driven.time[: len(values)], values, channels, name=run.name, source=run.source
+    )
+    left, strayed = rollout.outside[:end], None
     if left.any():
-        exogenous = s.order.split_exogenous(from_host(driven.values[:end]))
-        inputs = np.asarray(model.join(x[:end], *exogenous))
-        seen = departures(model.region, s.inputs, time[:end], inputs, left, weights)
+        # Copies, or what the trajectory holds: the rollout's arrays may be parts of larger ones.
+        states = trajectory.values[:end, : len(s.states)]
+        strayed = StrayedPath(model.region, s, driven, states, left.copy())
     return Simulation(
-        trajectory=Trajectory(time, values, channels, name=run.name, source=run.source),
+        trajectory=trajectory,
         status=status,
-        ended=float(time[end - 1]),
+        ended=float(driven.time[end - 1]),
         reason=reason,
-        outside=float(mean_over(left, weights)),
-        departures=seen,
-        # A copy: the rollout's arrays may be parts of larger ones.
+        outside=float(mean_over(left, _weights(driven.time[:end]))),
+        strayed=strayed,
         distance=np.sqrt(rollout.distance[: len(values)]),
     )
 
