@@ -12,6 +12,11 @@ def demo() -> ModuleType:
     return neighbour("demo")
 
 
+def bundled() -> ModuleType:
+    """The bundled runs of the turbine, and how to read them, as a module."""
+    return neighbour("turbine_runs")
+
+
 def neighbour(name: str) -> ModuleType:
     """A script of the turbine's examples as a module."""
     return importlib.import_module(name)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import dfsm
-from benchmarks.accuracy import demo, neighbour
+from benchmarks.accuracy import bundled, neighbour
 from benchmarks.twins import TWINS
 from dfsm.demos.two_link_robot.multi_fidelity import fit_settings
 from dfsm.errors import hushed
@@ -95,8 +95,8 @@ def _constant(grid: np.ndarray, parts: Sequence[RolloutErrors]) -> np.ndarray:
 
 
 def _turbine() -> Case:
-    turbine, rotor = demo(), neighbour("rotor_model")
-    training = [*turbine.runs(rotor.WINDS, range(1, 3)), *turbine.perturbed(testing=False)]
+    turbine, rotor = bundled(), neighbour("rotor_model")
+    training = [*turbine.runs(turbine.ALL_WINDS, range(1, 3)), *turbine.perturbed(testing=False)]
     base = rotor.settings(())
     table = replace(base.terms[0], memory="speed", induction="steady", uncertainty=0.0)
     kept = {"corrected": None, "azimuth": None, "outputs": ("TwrBsMyt",)}
@@ -105,10 +105,10 @@ def _turbine() -> Case:
         training,
         replace(base, **bare, terms=(table,)),
         {
-            "seen winds": turbine.runs(rotor.WINDS, range(9, 11)),
+            "seen winds": turbine.runs(turbine.ALL_WINDS, range(9, 11)),
             "perturbed": turbine.perturbed(testing=True),
-            "unseen winds": rotor.between(rotor.BETWEEN),
-            "unseen winds, perturbed": rotor.between(rotor.BETWEEN_PERTURBED),
+            "unseen winds": turbine.between(turbine.BETWEEN),
+            "unseen winds, perturbed": turbine.between(turbine.BETWEEN_PERTURBED),
         },
     )
 

@@ -1,7 +1,7 @@
 """What limits the model of the floating turbine: data, size, or what the three wind signals tell.
 
-The demo's model with fewer training runs, with networks of other sizes, and with a force that no
-user has: the rotor's recorded thrust, which it takes as if it were a disturbance. Everything else
+The model of `scheduled` with fewer training runs, with networks of other sizes, and with a force
+that no user has: the rotor's recorded thrust, which it takes as if it were a disturbance. All else
 is as in `rollouts`: refinement holds the same share of runs out, seeds 9 and 10 and three perturbed
 runs have no part in any choice.
 
@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 import dfsm
-from benchmarks.accuracy import demo
+from benchmarks import scheduled
+from benchmarks.accuracy import bundled
 from benchmarks.rollouts import errors, low_passed, uncorrected
 from dfsm.core.types import Array
 from dfsm.refinement.rollout_error import record_of
@@ -37,12 +38,12 @@ Runs = Sequence[dfsm.Trajectory]
 
 def run() -> dict[str, Any]:
     """Errors of the variants, the torque coefficient by least squares, and the field's share."""
-    turbine, results = demo(), {}
-    winds = turbine.WINDS["all winds"]
+    turbine, results = bundled(), {}
+    winds = turbine.ALL_WINDS
     tests = [
         with_thrust(r) for r in (turbine.runs(winds, range(9, 11)), turbine.perturbed(testing=True))
     ]
-    field, same = None, _sized(turbine.REFINEMENT.network)
+    field, same = None, _sized(scheduled.REFINEMENT.network)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)
         for name, runs, choices, refinement in variants(turbine):
@@ -67,7 +68,7 @@ def variants(
     turbine: Any,
 ) -> Iterator[tuple[str, Runs, dfsm.FitSettings, dfsm.RefineSettings]]:
     """Name, training runs, and how to fit and refine."""
-    winds, full, refinement = turbine.WINDS["all winds"], uncorrected(turbine), turbine.REFINEMENT
+    winds, full, refinement = turbine.ALL_WINDS, uncorrected(), scheduled.REFINEMENT
     perturbed = turbine.perturbed(testing=False)
     every = [*turbine.runs(winds, range(1, 9)), *perturbed]
     for seeds in SEEDS:
@@ -91,10 +92,10 @@ def with_thrust(runs: Runs) -> list[dfsm.Trajectory]:
 
 def braking(turbine: Any) -> dict[str, list[float]]:
     """Torque's effect on the speed's derivative (rpm/s per kN m), smallest and largest over w."""
-    full = uncorrected(turbine)
-    runs = turbine.runs(turbine.WINDS["all winds"], range(1, 9))
+    full = uncorrected()
+    runs = turbine.runs(turbine.ALL_WINDS, range(1, 9))
     free = replace(full.linear, known={})
-    known = turbine.BRAKING["GenSpeed"]["GenTq"]
+    known = scheduled.BRAKING["GenSpeed"]["GenTq"]
     effects = {"one over the inertia": [known, known]}
     for name, linear in (
         ("LTI", dfsm.LTI()),
@@ -117,9 +118,9 @@ def field_shares(model: dfsm.DFSM, runs: Runs) -> dict[str, Any]:
     """
     field = dfsm.read(DATA / "field.parquet")
     run = next(r for r in runs if r.name == field.name)
-    record = record_of(model, run, 0.5, demo().START, None)
+    record = record_of(model, run, 0.5, bundled().START, None)
     inputs, left = record.inputs[2 * record.before :: 2], record.left_over(model)
-    time = demo().START + record.step * np.arange(len(left))
+    time = bundled().START + record.step * np.arange(len(left))
     slow = lambda a: low_passed(a - a.mean(axis=0), record.step, CUTOFF)  # noqa: E731
     names = model.signals.exogenous
     three = slow(inputs[:, [names.index(n) for n in ("RotWind", "RotShearV", "RotShearH")]])

@@ -106,11 +106,10 @@ def replace_runs(asked: TuningTask, count: int) -> TuningTask:
 def rosco_task(model: Path, deck: Path) -> TuningTask:
     """Five parameters of ROSCO over twelve runs of 600 s of the IEA-15 floating turbine."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "iea15"))
-    import demo
-    from rotor_model import with_rings
+    from turbine_runs import DATA, START, with_rings
 
     names = [f"{wind}mps_s{seed:02d}" for wind in ("06", "12", "18") for seed in (1, 2, 9, 10)]
-    paths = [next(demo.DATA.glob(f"iea15_2dof_{n}.[op]*")) for n in names]
+    paths = [next(DATA.glob(f"iea15_2dof_{n}.[op]*")) for n in names]
     with hushed():
         runs = with_rings(dfsm.read_all(paths))
     discon = dfsm.read_discon(deck)
@@ -123,7 +122,7 @@ def rosco_task(model: Path, deck: Path) -> TuningTask:
         constraints=(dfsm.Limit(measure="rate", channel="BldPitch1", at_most=2.0),),
     )
     law = dfsm.read_rosco(discon, interval=0.05)
-    settings = dfsm.TuneSettings(start=demo.START)
+    settings = dfsm.TuneSettings(start=START)
     return TuningTask(dfsm.load(model), runs, law, asked, discon, FLOATING, settings)
 
 

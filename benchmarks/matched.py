@@ -3,8 +3,8 @@
 Five of the turbine's training runs repeat wind and waves of others with perturbed controls, and so
 do its three perturbed test runs. What a model does not see of the wind is the same in both runs of
 such a pair, so that the difference between them shows what the controls did, and nothing else. The
-demo's refinement is repeated with such runs taken as unrelated, as in the demo, and with errors
-that correlate. Below rated wind, a model that is told what moves the rotor is measured beside it.
+refinement of `scheduled` is repeated with such runs taken as unrelated, and with errors that
+correlate. Below rated wind, a model that is told what moves the rotor is measured beside it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 import dfsm
-from benchmarks.accuracy import demo
+from benchmarks import scheduled
+from benchmarks.accuracy import bundled
 from benchmarks.rollouts import STATES, errors, low_passed, recorded
 from dfsm.core.types import Array
 
@@ -30,8 +31,8 @@ Pair = tuple[dfsm.Trajectory, dfsm.Trajectory]
 
 def run() -> dict[str, Any]:
     """Errors of rollouts and of differences, and what differences of records tell by themselves."""
-    turbine, results, models = demo(), {}, {}
-    winds = turbine.WINDS["all winds"]
+    turbine, results, models = bundled(), {}, {}
+    winds = turbine.ALL_WINDS
     closed = turbine.runs(winds, range(1, 9))
     training = [*closed, *turbine.perturbed(testing=False)]
     tests, perturbed = turbine.runs(winds, range(9, 11)), turbine.perturbed(testing=True)
@@ -39,14 +40,14 @@ def run() -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dfsm.DfsmWarning)
         for correlation in CORRELATIONS:
-            refinement = replace(turbine.REFINEMENT, correlation=correlation)
-            model = dfsm.fit(training, turbine.refined_settings(), refinement).model
+            refinement = replace(scheduled.REFINEMENT, correlation=correlation)
+            model = dfsm.fit(training, scheduled.settings(), refinement).model
             results[str(correlation)] = judged(model, tests, pairs)
             if not correlation:
                 models["all winds"] = model
-        models["wind below rated"] = turbine.below_rated().model
-    tests = turbine.runs([turbine.BELOW_RATED], range(9, 11))
-    pair = next(pair for pair in pairs if f"_{turbine.BELOW_RATED}mps" in pair[0].name)
+        models["wind below rated"] = scheduled.below_rated().model
+    tests = turbine.runs([scheduled.BELOW_RATED], range(9, 11))
+    pair = next(pair for pair in pairs if f"_{scheduled.BELOW_RATED}mps" in pair[0].name)
     below = {name: judged(model, tests, [pair]) for name, model in models.items()}
     names = [p.name.removeprefix("iea15_2dof_").removesuffix("_ol") for p in perturbed]
     slopes = [speed_slopes(turbine, pair) for pair in pairs]
@@ -66,7 +67,7 @@ def judged(
 
 def difference_errors(model: dfsm.DFSM, pair: Pair) -> list[float]:
     """NRMSE per state of the difference between two rollouts, below the cutoff of `rollouts`."""
-    rollouts = [dfsm.simulate(model, r, start=demo().START).trajectory for r in pair]
+    rollouts = [dfsm.simulate(model, r, start=bundled().START).trajectory for r in pair]
     predicted = _difference([r.select(STATES).values for r in rollouts])
     truth = _difference([recorded(r) for r in pair])
     return list(np.sqrt(np.mean((predicted - truth) ** 2, axis=0)) / truth.std(axis=0))

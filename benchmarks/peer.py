@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 import dfsm
-from benchmarks.accuracy import demo
+from benchmarks.accuracy import bundled
 from benchmarks.rollouts import STATES, judged
 from dfsm.core.types import Array
 
@@ -36,8 +36,8 @@ FAR = 10.0
 
 def run() -> dict[str, Any]:
     """Errors of the peer on the test runs, as `benchmarks.rollouts.run` has those of dfsm."""
-    turbine = demo()
-    winds = turbine.WINDS["all winds"]
+    turbine = bundled()
+    winds = turbine.ALL_WINDS
     both = [*turbine.runs(winds, range(1, 9)), *turbine.perturbed(testing=False)]
     # The split that dfsm's refinement makes.
     training, held = dfsm.Dataset(both).split(dfsm.HoldOut().share)
@@ -89,7 +89,7 @@ def environment() -> Path:
 
 def resampled(run: dfsm.Trajectory) -> tuple[Array, Array]:
     """Inputs and the wave's rate, (step, input), averaged over each step; outputs at its begin."""
-    run = run.window(demo().START - WARM_UP)
+    run = run.window(bundled().START - WARM_UP)
     if run.time_step is None:
         raise ValueError("resampling needs an equidistant mesh")
     every = round(STEP / run.time_step)
@@ -108,7 +108,7 @@ def states(run: dfsm.Trajectory, outputs: Array, seen: Array) -> Array | None:
     low, high = seen.min(axis=0), seen.max(axis=0)
     if not (np.abs(outputs - (low + high) / 2) <= FAR * (high - low) / 2).all():
         return None
-    time = run.window(demo().START).time
+    time = run.window(bundled().START).time
     values = np.full((len(time), len(STATES)), np.nan)
     steps = time[0] + STEP * np.arange(len(outputs))
     values[:, [STATES.index(name) for name in OUTPUTS]] = CubicSpline(steps, outputs)(time)

@@ -18,7 +18,8 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 import dfsm
-from benchmarks.accuracy import demo
+from benchmarks import scheduled
+from benchmarks.accuracy import bundled, demo
 from dfsm.core.types import Array
 from dfsm.data.derivatives import differentiate
 from dfsm.data.wind import CORRECTED_WIND
@@ -38,8 +39,8 @@ SWEEP_SECONDS = 1500.0
 
 def run() -> dict[str, Any]:
     """Errors of every model, and loads and the sweep of constant winds for the last one."""
-    turbine = demo()
-    closed = turbine.runs(turbine.WINDS["all winds"], range(9, 11))
+    turbine = bundled()
+    closed = turbine.runs(turbine.ALL_WINDS, range(9, 11))
     perturbed = turbine.perturbed(testing=True)
     results, model = {}, None
     with warnings.catch_warnings():
@@ -64,12 +65,12 @@ def run() -> dict[str, Any]:
 
 def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
     """Name, models (one per wind speed, or one for all) and seconds of fitting, step by step."""
-    winds = turbine.WINDS["all winds"]
+    winds = turbine.ALL_WINDS
     closed = turbine.runs(winds, range(1, 9))
     both = [*closed, *turbine.perturbed(testing=False)]
-    full = turbine.refined_settings()
+    full = scheduled.settings()
     paper = dfsm.FitSettings(
-        states=turbine.settings(5).states,
+        states=demo().settings(5).states,
         controls=full.controls,
         disturbances=("RotWind",),
         outputs=full.outputs,
@@ -89,10 +90,10 @@ def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
         begin = time.perf_counter()
         models = [dfsm.fit(turbine.runs([w], range(1, 9)), choices).model for w in winds]
         yield name, models, time.perf_counter() - begin
-    known = uncorrected(turbine)
+    known = uncorrected()
     plain = replace(known, linear=replace(known.linear, known={}))
     average = replace(plain, disturbances=("RotWind", "Wave1Elev"), features=())
-    refinement = turbine.REFINEMENT
+    refinement = scheduled.REFINEMENT
     physical = replace(refinement, network=0, decay=0.0)
     latent = replace(physical, latent_inputs=None)
     bare = replace(latent, latents=0)
@@ -105,24 +106,24 @@ def ladder(turbine: Any) -> Iterator[tuple[str, list[dfsm.DFSM], float]]:
         ("and latent states", both, plain, latent),
         ("and the inertia, torque drives no latent state", both, known, physical),
         ("and a network, without perturbed runs", closed, known, refinement),
-        ("and a network: the demo's model", both, full, refinement),
+        ("and a network", both, full, refinement),
     ):
         begin = time.perf_counter()
         yield name, [dfsm.fit(runs, choices, refine).model], time.perf_counter() - begin
 
 
-def uncorrected(turbine: Any) -> dfsm.FitSettings:
+def uncorrected() -> dfsm.FitSettings:
     """The demo's settings without outputs, which have no part in a rollout of the states."""
-    return replace(turbine.refined_settings(), corrective=dfsm.NoCorrection(), outputs=())
+    return replace(scheduled.settings(), corrective=dfsm.NoCorrection(), outputs=())
 
 
 def leak(turbine: Any) -> dict[str, Any]:
     """Errors with three winds as the disturbance: one of them measured on the moving rotor."""
-    winds = turbine.WINDS["all winds"]
+    winds = turbine.ALL_WINDS
     training, tests = turbine.runs(winds, range(1, 9)), turbine.runs(winds, range(9, 11))
     results = {}
     for wind, hub in (("RtVAvgxh", None), (CORRECTED_WIND, HUB_HEIGHT), ("RotWind", None)):
-        full = turbine.refined_settings()
+        full = scheduled.settings()
         choices = replace(
             full,
             disturbances=(wind, "Wave1Elev"),
@@ -142,7 +143,7 @@ def errors(models: Sequence[dfsm.DFSM], runs: Sequence[dfsm.Trajectory]) -> dict
     states = []
     for run in runs:
         model = models[0 if len(models) == 1 else WINDS.index(run.name.split("_")[2])]
-        rollout = dfsm.simulate(model, run, start=demo().START)
+        rollout = dfsm.simulate(model, run, start=bundled().START)
         completed = rollout.status is dfsm.Status.COMPLETED
         states.append(rollout.trajectory.select(STATES).values if completed else None)
     return judged(runs, states)
@@ -174,7 +175,7 @@ def judged(runs: Sequence[dfsm.Trajectory], states: Sequence[Array | None]) -> d
 def recorded(run: dfsm.Trajectory) -> Array:
     """Recorded states; the same for all models, however they take derivatives."""
     specs = [dfsm.StateSpec(name="PtfmPitch", order=2), dfsm.StateSpec(name="GenSpeed")]
-    return differentiate(run, specs).trajectory.window(demo().START).select(STATES).values
+    return differentiate(run, specs).trajectory.window(bundled().START).select(STATES).values
 
 
 def _low_passed(run: dfsm.Trajectory, values: Array) -> Array:
@@ -199,8 +200,8 @@ def loads(model: dfsm.DFSM, runs: Sequence[dfsm.Trajectory]) -> dict[str, Any]:
     """Tower-base loads along the rollouts, run by run."""
     results = {}
     for run in runs:
-        rollout = dfsm.simulate(model, run, start=demo().START).trajectory
-        recorded = run.window(demo().START)
+        rollout = dfsm.simulate(model, run, start=bundled().START).trajectory
+        recorded = run.window(bundled().START)
         speed = recorded["GenSpeed"].mean() / 60
         passing = Band("3P", 2.4 * speed, 3.6 * speed)
         results[run.name] = {name: _load(recorded, rollout, name, passing) for name in LOADS}

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 import dfsm
-from benchmarks.accuracy import demo, neighbour
+from benchmarks import scheduled
+from benchmarks.accuracy import bundled, neighbour
 from benchmarks.rollouts import STATES, errors, uncorrected
 
 # The optimum: run, its horizon in s and the nodes over it.
@@ -27,17 +28,17 @@ _WIND, _HORIZON, _NODES = "06", (100.0, 400.0), 301
 
 def run() -> dict[str, Any]:
     """Errors of every model on every group of tests, and mean power of its optimum in MW."""
-    turbine, rotor = demo(), neighbour("rotor_model")
-    training = [*turbine.runs(rotor.WINDS, range(1, 9)), *turbine.perturbed(testing=False)]
+    turbine, rotor = bundled(), neighbour("rotor_model")
+    training = [*turbine.runs(turbine.ALL_WINDS, range(1, 9)), *turbine.perturbed(testing=False)]
     tests = {
-        "seeds 9, 10": turbine.runs(rotor.WINDS, range(9, 11)),
+        "seeds 9, 10": turbine.runs(turbine.ALL_WINDS, range(9, 11)),
         "perturbed": turbine.perturbed(testing=True),
-        "8, 10, 14, 16 m/s": rotor.between(rotor.BETWEEN),
-        "10, 14 m/s perturbed": rotor.between(rotor.BETWEEN_PERTURBED),
+        "8, 10, 14, 16 m/s": turbine.between(turbine.BETWEEN),
+        "10, 14 m/s perturbed": turbine.between(turbine.BETWEEN_PERTURBED),
     }
-    training = rotor.with_rings(training)
-    tests = {label: rotor.with_rings(runs) for label, runs in tests.items()}
-    plain = uncorrected(turbine)
+    training = turbine.with_rings(training)
+    tests = {label: turbine.with_rings(runs) for label, runs in tests.items()}
+    plain = uncorrected()
     bare = {"corrective": dfsm.NoCorrection(), "corrected": None, "outputs": ()}
     whole = replace(rotor.settings(), **bare)
 
@@ -50,10 +51,10 @@ def run() -> dict[str, Any]:
     rings = with_rotor(whole, memory="speed", **steady)
     through_wind = with_rotor(whole, **steady)
     factors = with_rotor(whole, induction="steady")
-    by_pitch = replace(turbine.REFINEMENT, network=0)
+    by_pitch = replace(scheduled.REFINEMENT, network=0)
     results = {}
     for name, settings, refinement in (
-        ("the demo's model", plain, turbine.REFINEMENT),
+        ("a schedule and a network", plain, scheduled.REFINEMENT),
         ("the rotor's table instead of a schedule and a network", table, by_pitch),
         ("and the wind over six rings", rings, by_pitch),
         ("and latent states that change the wind at the rotor", through_wind, by_pitch),

@@ -19,7 +19,7 @@ from dfsm.control import (
 )
 from dfsm.control.nlp.terms import functions_of
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.errors import DfsmError
+from dfsm.errors import DfsmError, DfsmWarning
 from systems import linear_model
 
 # -- what a problem can hold --------------------------------------------------------------------
@@ -223,7 +223,9 @@ def test_a_surrogate_is_controlled_and_the_region_reported():
     assert found.linear_quadratic
     assert found.replays[0].relative < 1e-4
     narrow = surrogate(span=2.3)
-    out = solved(narrow)
+    told = r"surrogate: .* outside the training data for .*: u0 goes to .*stay_inside keeps it near"
+    with pytest.warns(DfsmWarning, match=told):
+        out = solved(narrow)
     assert 0.0 < out.outside < 1.0
     assert out.objective == pytest.approx(found.objective, rel=1e-6)
     inside = solved(narrow, replace(QUICK, stay_inside=True))

@@ -9,14 +9,14 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 import dfsm
-from benchmarks import limits, matched, turbine_tables
-from benchmarks.accuracy import demo
+from benchmarks import limits, matched, scheduled, turbine_tables
+from benchmarks.accuracy import bundled, demo
 
 ROOT = Path(__file__).parents[1]
 
 
 def test_the_thrust_is_that_of_the_run():
-    run = dfsm.read(demo().DATA / "iea15_2dof_12mps_s09.outb")
+    run = dfsm.read(bundled().DATA / "iea15_2dof_12mps_s09.outb")
     others = [n for n in run.names if n != limits.THRUST.name]
     (given,) = limits.with_thrust([run.select(others)])
     thrust = run.channel(limits.THRUST.name)
@@ -28,7 +28,7 @@ def test_the_thrust_is_that_of_the_run():
 
 def test_the_field_averages_to_the_wind_of_its_run():
     field = dfsm.read(limits.DATA / "field.parquet")
-    run = demo().runs(["12"], range(8, 9))[0].window(50.0, 650.0)
+    run = bundled().runs(["12"], range(8, 9))[0].window(50.0, 650.0)
     field = field.resample(run.time)
     # Rings weighted with their areas make up the disk.
     disk = (field["ring to 40 m"] + 3 * field["ring to 80 m"] + 5 * field["ring to 120 m"]) / 9
@@ -64,18 +64,18 @@ def test_tables_have_a_line_for_everything():
 
 
 def test_perturbed_runs_repeat_the_wind_and_waves_of_controlled_ones():
-    turbine = demo()
+    turbine = bundled()
     runs = [*turbine.runs(["06", "12"], range(1, 5)), *turbine.perturbed(testing=True)[:2]]
     data = dfsm.Dataset(runs)
-    groups = data.matched([*turbine.settings(5).disturbances])
+    groups = data.matched([*demo().settings(5).disturbances])
     pairs = {tuple(sorted(data[k].name for k in group)) for group in groups if len(group) > 1}
     names = ("iea15_2dof_06mps_s02", "iea15_2dof_12mps_s04")
     assert pairs == {(name, f"{name}_ol") for name in names}
 
 
 def test_differences_of_records_tell_the_inertia():
-    turbine = demo()
-    known = turbine.BRAKING["GenSpeed"]["GenTq"]
+    turbine = bundled()
+    known = scheduled.BRAKING["GenSpeed"]["GenTq"]
     (controlled,) = turbine.runs(["12"], range(4, 5))
     perturbed = turbine.perturbed(testing=True)[1]
     slopes = matched.speed_slopes(turbine, (controlled, perturbed))

@@ -9,7 +9,7 @@ import pytest
 
 import dfsm
 from benchmarks import peer, turbine_tables
-from benchmarks.accuracy import demo
+from benchmarks.accuracy import bundled
 from benchmarks.rollouts import judged
 from dfsm.core.files import json_value
 
@@ -20,7 +20,7 @@ START = round(peer.WARM_UP / peer.STEP)
 
 @pytest.fixture(scope="module")
 def run() -> dfsm.Trajectory:
-    return demo().runs(["06"], range(10, 11))[0]
+    return bundled().runs(["06"], range(10, 11))[0]
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +31,11 @@ def record(run: dfsm.Trajectory) -> np.ndarray:
 
 def test_inputs_are_means_over_steps_and_outputs_their_first_values(run):
     u, y = peer.resampled(run)
-    begin = demo().START - peer.WARM_UP
+    begin = bundled().START - peer.WARM_UP
     first = (run.time >= begin) & (run.time < begin + peer.STEP)
     assert u.shape == (len(y), len(peer.INPUTS) + 1)
     assert u[0, 0] == pytest.approx(run["GenTq"][first].mean())
-    assert y[START, 0] == run["PtfmPitch"][run.time == demo().START][0]
+    assert y[START, 0] == run["PtfmPitch"][run.time == bundled().START][0]
     assert y[-1, 0] == run["PtfmPitch"][-1]
     elevation = run["Wave1Elev"][run.time >= begin][:: round(peer.STEP / 0.05)]
     rate = np.diff(elevation) / peer.STEP

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import demo
+from benchmarks import scheduled
+from benchmarks.accuracy import bundled, demo
 from dfsm.control import load_solution, save_solution
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fitting.corrective import NoCorrection
@@ -60,7 +61,7 @@ def found(region: Region) -> ControlStudy:
 
 
 def test_every_case_is_solved_within_its_bounds(found: ControlStudy):
-    assert [r.variant for r in found.results] == ["a", "a", "b", "b", "b, inside", "b, inside"]
+    assert [r.case.key for r in found.results] == ["a", "a", "b", "b"]
     for r in found.results:
         assert r.solution.solved, r.solution.message
         assert r.solution.violation < 1e-6
@@ -80,7 +81,7 @@ def test_series_can_be_solved_in_other_processes(region: Region, found: ControlS
     np.testing.assert_array_equal(model.f.coefficients, region.model.f.coefficients)
     again = pickle.loads(pickle.dumps(found.results))
     for one, other in zip(again, found.results, strict=True):
-        assert one.variant == other.variant
+        assert one.case == other.case
         assert one.power == other.power
         np.testing.assert_array_equal(one.run.values, other.run.values)
 
@@ -100,10 +101,9 @@ def test_bounds_of_this_turbine_come_from_its_own_runs(region: Region):
 
 
 def test_trends_of_the_paper_in_the_transition_region(found: ControlStudy):
-    for variant in ("b", "b, inside"):
-        told = trends(found.series()[found.results[0].series, variant])
-        assert list(told) == list(CLAIMS)
-        assert all(v.startswith("yes") for v in told.values()), told
+    told = trends(found.series()[found.results[0].series, "b"])
+    assert list(told) == list(CLAIMS)
+    assert all(v.startswith("yes") for v in told.values()), told
 
 
 def test_power_is_in_megawatts_and_below_what_the_wind_holds(found: ControlStudy):
@@ -117,8 +117,9 @@ def test_power_is_in_megawatts_and_below_what_the_wind_holds(found: ControlStudy
 
 
 def test_staying_inside_keeps_near_the_data_at_a_cost(region: Region, found: ControlStudy):
-    results = {(r.variant, r.most_pitch): r for r in found.results}
-    free, inside = results["b", 5.0], results["b, inside", 5.0]
+    results = {(r.case.key, r.most_pitch): r for r in found.results}
+    inside = results["b", 5.0]
+    free = optimize(region, region.tests[0], replace(inside.case, inside=False), 5.0, SIZE)
     assert free.outside[TORQUE] > 0.5
     assert not {TORQUE, BLADE, PITCH, SPEED} & set(inside.outside)
     assert free.solution.objective < inside.solution.objective
@@ -131,7 +132,7 @@ def test_staying_inside_keeps_near_the_data_at_a_cost(region: Region, found: Con
 
 
 def test_an_optimum_that_keeps_a_tighter_limit_is_not_sought_again(region: Region):
-    size = ControlStudySettings(points=60, pitch_limits=(30.0, 20.0, 5.0), inside=False)
+    size = ControlStudySettings(points=60, pitch_limits=(30.0, 20.0, 5.0))
     results = study([region], size).results
     assert [r.most_pitch for r in results] == [30.0, 20.0, 5.0] * 2
     loose, tighter, tight = results[3:]
@@ -156,13 +157,14 @@ def test_the_best_power_coefficient_is_that_of_steady_wind_or_of_a_training_run(
 
 
 def test_below_rated_wind_the_model_is_told_what_moves_the_rotor(monkeypatch):
-    data, asked = demo(), []
-    training = data.runs([data.BELOW_RATED], range(1, 3))
+    data, asked = bundled(), []
+    training = data.runs([scheduled.BELOW_RATED], range(1, 3))
     with monkeypatch.context() as patch:
         # What it would be fitted to; the refinement takes a minute.
         patch.setattr(data, "runs", lambda *_: training)
-        patch.setattr(data.dfsm, "fit", lambda *a: asked.extend(a) or SimpleNamespace(model=None))
-        data.below_rated()
+        fit_of = scheduled.dfsm
+        patch.setattr(fit_of, "fit", lambda *a: asked.extend(a) or SimpleNamespace(model=None))
+        scheduled.below_rated()
     runs, choices, refinement = asked
     names = [r.name.removeprefix("iea15_2dof_") for r in runs]
     assert names == ["06mps_s01", "06mps_s02", "06mps_s01_ol"]
@@ -213,7 +215,7 @@ def test_the_page_holds_every_series_and_the_figures_every_limit(
     assert article.sections[0].paragraphs[0] == f"{len(found.results)} of {len(found.results)} " + (
         "problems were solved."
     )
-    best = {r.most_pitch: r.power for r in found.results if r.variant == "b"}
+    best = {r.most_pitch: r.power for r in found.results if r.case.key == "b"}
     (curve,) = next(p for p in power.panels if p.title == "case b").curves
     assert dict(zip(curve.x, curve.y, strict=True)) == best
     for figure in others:

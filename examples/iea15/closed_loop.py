@@ -15,13 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-import demo  # its neighbour
 import dfsm
 from dfsm.cli.tables import print_article
 from dfsm.errors import hushed
 from dfsm.loops.load_cases import Figures
 from dfsm.report.closed_loop_article import closed_loop_article
-from rotor_model import WINDS, with_rings
+from turbine_runs import ALL_WINDS, DATA, START, runs, with_rings
 
 # The nacelle is rigid in this model: it turns with the platform.
 MEASUREMENTS = {"NcIMURAys": "PtfmPitch_dot_dot"}
@@ -39,7 +38,7 @@ def changed(deck: dfsm.ROSCO, letter: str) -> dfsm.ROSCO:
 
 def spread(run: dfsm.Trajectory) -> np.ndarray:
     """Standard deviations, and the tower-base DEL, after the start-up."""
-    run = run.window(demo.START)
+    run = run.window(START)
     load = Figures.of(run.time, run["TwrBsMyt"]).damage["4"]
     return np.array([*(run[name].std() for name in STATISTICS), load])
 
@@ -49,12 +48,12 @@ def print_changes(model: dfsm.DFSM, deck: dfsm.ROSCO, folder: Path) -> None:
     print("ratio to the deck's gains, OpenFAST → closed loop: " + ", ".join([*STATISTICS, "DEL"]))
     for path in sorted(folder.glob("iea15_2dofg?_*mps_s*.outb")):
         head, letter, tail = path.stem.partition("2dofg")[0], path.stem[11], path.stem[13:]
-        base = dfsm.read(demo.DATA / f"{head}2dof_{tail}.parquet")
+        base = dfsm.read(DATA / f"{head}2dof_{tail}.parquet")
         (run,) = with_rings([base])
         laws = {"deck": deck, "changed": changed(deck, letter)}
         true = spread(dfsm.read(path)) / spread(base)
         loops = [
-            dfsm.closed_loop(model, run, law, start=demo.START, measurements=MEASUREMENTS)
+            dfsm.closed_loop(model, run, law, start=START, measurements=MEASUREMENTS)
             for law in laws.values()
         ]
         if any(loop.status is not dfsm.LoopStatus.COMPLETED for loop in loops):
@@ -75,9 +74,9 @@ def main() -> None:
     model = dfsm.load(told.model)
     deck = dfsm.read_rosco(told.deck, interval=0.05)
     with hushed():
-        runs = with_rings(demo.runs(WINDS, range(9, 11)))
+        tests = with_rings(runs(ALL_WINDS, range(9, 11)))
         validation = dfsm.validate_closed_loop(
-            model, runs, deck, start=demo.START, measurements=MEASUREMENTS
+            model, tests, deck, start=START, measurements=MEASUREMENTS
         )
         article = closed_loop_article(validation, str(told.model), str(told.deck))
         print_article(replace(article, sections=article.sections[:2]))

@@ -23,6 +23,7 @@ from dfsm.report.publish import publish
 from turbine_article import control_article
 from turbine_control import ControlStudy, study
 from turbine_problem import Region
+from turbine_runs import START, runs, with_rings
 
 # Winds (m/s, as in the file names) and the seeds to optimize for: two in the transition region,
 # one below and one above it.
@@ -30,14 +31,13 @@ SERIES = {"12": range(9, 11), "06": range(9, 10), "18": range(9, 10)}
 
 
 def regions(models: Path) -> list[Region]:
-    """Models and runs of each region; one model serves all but that below rated wind."""
+    """Models and runs of each region; one model serves all."""
     listed = []
     for wind, seeds in SERIES.items():
         name = f"{float(wind):g} m/s"
-        best = demo.FOR_CONTROL if wind == demo.BELOW_RATED else "all winds"
-        own, model = (dfsm.load(demo.folder(models, label)) for label in (name, best))
-        training, tests = demo.runs([wind], range(1, 9)), demo.runs([wind], seeds)
-        listed.append(Region(name, float(wind), own, model, training, tests, demo.START))
+        own, best = (dfsm.load(demo.folder(models, label)) for label in (name, demo.REFINED))
+        training, tests = (with_rings(runs([wind], of)) for of in (range(1, 9), seeds))
+        listed.append(Region(name, float(wind), own, best, training, tests, START))
     return listed
 
 

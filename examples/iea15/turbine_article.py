@@ -84,7 +84,8 @@ def control_article(study: ControlStudy) -> Article:
             "over the horizon and a limit Θp,max on the platform pitch: the study of Sundarrajan "
             "and Herber (IMECE 2023, Sec. 4) on other runs of the same turbine. Case a has the "
             "paper's bounds and a model fitted as in the paper; case b has the bounds of the "
-            "turbine that was simulated and a model refined on rollouts that knows some mechanics."
+            "turbine that was simulated, one model for all winds with the rotor's table inside, "
+            "and stays where its training data lie."
         ),
         sections=(
             answer_section(study),
@@ -102,14 +103,14 @@ def answer_section(study: ControlStudy) -> Section:
     solved = [r for r in study.results if r.solution.solved]
     sentences = [f"{len(solved)} of {len(study.results)} problems were solved."]
     curves: dict[str, list[Curve]] = {}
-    for (name, variant), by_limit in study.series().items():
+    for (name, key), by_limit in study.series().items():
         kept = [by_limit[limit] for limit in sorted(by_limit) if by_limit[limit].solution.solved]
         if not kept:
             continue
         limits, power = [r.most_pitch for r in kept], [r.power for r in kept]
-        panel = curves.setdefault(variant, [])
+        panel = curves.setdefault(key, [])
         panel.append(Curve(_short(name), np.array(limits), np.array(power), len(panel) + 1))
-        if variant == "b" and len(kept) > 1:
+        if key == "b" and len(kept) > 1:
             cost = 1 - power[0] / power[-1]
             told = f"{cost:.1%} less" if cost >= _LEAST_COST else "as much"
             sentences.append(
@@ -121,8 +122,8 @@ def answer_section(study: ControlStudy) -> Section:
         "control_power",
         "Mean electrical power of the optimum over the limit of the platform pitch",
         tuple(
-            Panel(f"case {variant}", "Θp,max (deg)", "power (MW)", tuple(of), y_range=(0.0, most))
-            for variant, of in curves.items()
+            Panel(f"case {key}", "Θp,max (deg)", "power (MW)", tuple(of), y_range=(0.0, most))
+            for key, of in curves.items()
         ),
     )
     figures = (figure,) if curves else ()
@@ -137,8 +138,8 @@ def answer_section(study: ControlStudy) -> Section:
 def trends_section(study: ControlStudy) -> Section:
     """What the paper leads one to expect, checked series by series."""
     rows = [
-        (f"{_short(name)}, {variant}", *trends(by_limit).values())
-        for (name, variant), by_limit in study.series().items()
+        (f"{_short(name)}, {key}", *trends(by_limit).values())
+        for (name, key), by_limit in study.series().items()
     ]
     table = Table(
         "control_trends",
@@ -181,7 +182,7 @@ def trends(by_limit: Mapping[float, Result]) -> dict[str, str]:
     Parameters
     ----------
     by_limit
-        Results of one wind series and variant by Θ_p,max.
+        Results of one wind series and case by Θ_p,max.
     """
     solved = [by_limit[limit] for limit in sorted(by_limit) if by_limit[limit].solution.solved]
     if not solved:
@@ -248,9 +249,9 @@ def _series_section(name: str, results: Sequence[Result]) -> Section:
         paragraphs=tuple(_diagnoses(results)),
         tables=(table,),
         figures=tuple(
-            _figure(name, [r for r in results if r.variant == variant])
-            for variant in dict.fromkeys(r.variant for r in results)
-            if variant != "a" or first.region == "12 m/s"
+            _figure(name, [r for r in results if r.case.key == key])
+            for key in dict.fromkeys(r.case.key for r in results)
+            if key != "a" or first.region == "12 m/s"
         ),
     )
 
@@ -263,7 +264,7 @@ def _cells(r: Result) -> tuple[str | float | None, ...]:
     run, solution = r.run, r.solution
     speed = run[SPEED]
     return (
-        r.variant,
+        r.case.key,
         f"{r.most_pitch:g}",
         r.power if solution.solved else None,
         float(run[PITCH].max()),
@@ -282,11 +283,11 @@ def _cells(r: Result) -> tuple[str | float | None, ...]:
 def _diagnoses(results: Sequence[Result]) -> list[str]:
     """Where a problem has no solution, or leaves the training range."""
     told = []
-    for variant in dict.fromkeys(r.variant for r in results):
-        alike = [r for r in results if r.variant == variant]
+    for key in dict.fromkeys(r.case.key for r in results):
+        alike = [r for r in results if r.case.key == key]
         for r in alike:
             if not r.solution.solved:
-                told.append(f"Case {variant}, Θp,max = {r.most_pitch:g} deg: {r.solution.message}.")
+                told.append(f"Case {key}, Θp,max = {r.most_pitch:g} deg: {r.solution.message}.")
         shares: dict[str, list[float]] = {}
         for r in alike:
             for name, share in r.outside.items():
@@ -297,16 +298,15 @@ def _diagnoses(results: Sequence[Result]) -> list[str]:
             if max(values) >= 1
         ]
         if left:
-            told.append(f"Case {variant} leaves the training range in {listed(left)} (the most).")
+            told.append(f"Case {key} leaves the training range in {listed(left)} (the most).")
     return told
 
 
 def _figure(name: str, results: Sequence[Result]) -> Figure:
-    variant = results[0].variant
-    key = f"control_{_short(name)}_{variant.replace(', ', '_')}"
+    key = results[0].case.key
     return stacked_figure(
-        key,
-        f"Case {variant}, wind of {name}: wind, controls, states, power and tower-base loads for "
+        f"control_{_short(name)}_{key}",
+        f"Case {key}, wind of {name}: wind, controls, states, power and tower-base loads for "
         "every Θp,max. Dashed: bounds; those of the platform pitch in the colour of their case.",
         {f"Θp,max = {r.most_pitch:g} deg": r.solution for r in results},
         _FIGURE,

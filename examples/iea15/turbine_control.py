@@ -19,6 +19,7 @@ from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.core.workers import work_through
 from dfsm.data.trajectory import Trajectory
+from dfsm.errors import hushed
 from dfsm.models.dfsm import DFSM
 from turbine_problem import (
     BLADE,
@@ -37,8 +38,6 @@ from turbine_problem import (
     wind_power,
 )
 
-# Share of the horizon outside the training data above which case (b) is solved inside, too.
-_LEAVES = 0.01
 # What counts as "at the peak" of the platform pitch: this share of the horizon.
 _PEAK = 0.05
 
@@ -57,16 +56,12 @@ class ControlStudySettings:
         Of the horizon in s.
     tolerance
         Of the nonlinear program.
-    inside
-        Where solutions of case (b) leave the training data, solve it also with states and controls
-        kept inside.
     """
 
     points: int = 1000
     pitch_limits: tuple[float, ...] = (5.0, 6.0, 7.0)
     duration: float = 600.0
     tolerance: float = 1e-7
-    inside: bool = True
 
     def __post_init__(self) -> None:
         require(self.points >= 3, "points", self.points, "at least 3")
@@ -82,8 +77,8 @@ class Result:
     ----------
     region, series
         Names of the region and of the run whose wind it is.
-    case, most_pitch, inside
-        What bounds held: which case, Θ_p,max in deg, and whether the training range too.
+    case, most_pitch
+        What bounds held: which case, and Θ_p,max in deg.
     solution
         See `Solution`.
     recorded
@@ -98,16 +93,10 @@ class Result:
     series: str
     case: Case
     most_pitch: float
-    inside: bool
     solution: Solution
     recorded: Trajectory
     available: float
     outside: Mapping[str, float]
-
-    @property
-    def variant(self) -> str:
-        """E.g. ``"b, inside"``."""
-        return self.case.key + (", inside" if self.inside else "")
 
     @property
     def run(self) -> Trajectory:
@@ -175,10 +164,10 @@ class ControlStudy:
     gains: Mapping[str, tuple[float, float]]
 
     def series(self) -> dict[tuple[str, str], dict[float, Result]]:
-        """Results that differ in Θ_p,max only, by wind series and variant."""
+        """Results that differ in Θ_p,max only, by wind series and key of the case."""
         groups: dict[tuple[str, str], dict[float, Result]] = {}
         for r in self.results:
-            groups.setdefault((r.series, r.variant), {})[r.most_pitch] = r
+            groups.setdefault((r.series, r.case.key), {})[r.most_pitch] = r
         return groups
 
 
@@ -188,7 +177,6 @@ def optimize(
     case: Case,
     most_pitch: float,
     settings: ControlStudySettings,
-    near: Result | None = None,
 ) -> Result:
     """Solve the problem for one wind series and one limit of the platform pitch.
 
@@ -202,21 +190,18 @@ def optimize(
         Bounds.
     settings
         Nodes, horizon and tolerance.
-    near
-        Stay inside the training data, and start from this result.
     """
-    inside = near is not None
-    guess = near.solution if near is not None and near.solution.solved else None
     method = DirectTranscription(
         scheme="trapezoidal",
         mesh=settings.points - 1,
         refine=None,
         tolerance=settings.tolerance,
-        stay_inside=inside,
+        stay_inside=case.inside,
     )
     model = region.own if case is PAPER else region.model
     horizon = (region.start, region.start + settings.duration)
-    solution = solve(problem(model, wind, case, most_pitch, horizon), method, guess)
+    with hushed():  # where it leaves the training data stands in the result
+        solution = solve(problem(model, wind, case, most_pitch, horizon), method)
     run, names = solution.trajectory, [c.name for c in model.signals.inputs]
     beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
     outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
@@ -226,7 +211,6 @@ def optimize(
         series=wind.name,
         case=case,
         most_pitch=most_pitch,
-        inside=inside,
         solution=solution,
         recorded=recorded,
         available=region.best_coefficient * wind_power(recorded),
@@ -269,12 +253,8 @@ def _series(
     """All problems of one wind series, named by the numbers of its region and of its run there."""
     regions, settings = shared
     region = regions[task[0]]
-    wind, own = region.tests[task[1]], turbine_case(region)
-    paper, free = (_limits(region, wind, case, settings) for case in (PAPER, own))
-    results = [*paper, *free]
-    if settings.inside and any((r.solution.outside or 0.0) > _LEAVES for r in free):
-        results += _limits(region, wind, own, settings, free)
-    return results
+    wind, cases = region.tests[task[1]], (PAPER, turbine_case(region))
+    return [r for case in cases for r in _limits(region, wind, case, settings)]
 
 
 def _limits(
@@ -282,21 +262,18 @@ def _limits(
     wind: Trajectory,
     case: Case,
     settings: ControlStudySettings,
-    near: Sequence[Result] = (),
 ) -> list[Result]:
     """Results for all limits of the platform pitch, as they stand in `settings`.
 
-    Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too. Inside the
-    training data each is solved from its counterpart in `near`.
+    Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too.
     """
-    starts = {r.most_pitch: r for r in near}
     results: dict[float, Result] = {}
     last = None
     for limit in sorted(settings.pitch_limits, reverse=True):
         if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
             last = _tighter(last, limit)
         else:
-            last = optimize(region, wind, case, limit, settings, starts.get(limit))
+            last = optimize(region, wind, case, limit, settings)
         results[limit] = last
     return [results[limit] for limit in settings.pitch_limits]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +16,8 @@ from dfsm.control.nlp.transcription import DirectTranscription
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Solution
 from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmWarning
+from dfsm.models.departures import MUCH_OUTSIDE
 
 # By which factor the bound on the distance from the training data is tightened at most.
 _TIGHTER = 4.0
@@ -36,8 +39,9 @@ def solve(
         `DirectTranscription`, `MultipleShooting` or `SingleShooting`; None is the first with its
         defaults.
     guess
-        None starts from straight lines between the ends. A run gives the states and controls that
-        it holds; a solution, of any mesh or method, gives all and is stayed close to.
+        None starts from what a surrogate's training runs did in disturbances like these, or else
+        from straight lines between the ends. A run gives the states and controls that it holds; a
+        solution, of any mesh or method, gives all and is stayed close to.
     simulate
         Integrate the model with the optimal controls and report how far the states deviate.
 
@@ -51,8 +55,31 @@ def solve(
     DfsmError
         A function that names an unknown signal, is not finite at the start, or cannot be followed
         by JAX; bounds or settings that contradict each other.
+
+    Warns
+    -----
+    DfsmWarning
+        An optimum of a surrogate is outside its training data for part of the horizon.
     """
-    method = method or DirectTranscription()
+    solution = _solved(problem, method or DirectTranscription(), guess, simulate)
+    if solution.solved and (solution.outside or 0.0) > MUCH_OUTSIDE:
+        where = "; ".join(solution.departures)
+        advice = "" if method and method.stay_inside else "; stay_inside keeps it near the data"
+        warnings.warn(
+            f"{solution.name}: the optimum is outside the training data for "
+            f"{solution.outside:.1%} of the horizon: {where}{advice}",
+            DfsmWarning,
+            stacklevel=2,
+        )
+    return solution
+
+
+def _solved(
+    problem: OptimalControlProblem,
+    method: Method,
+    guess: Solution | Trajectory | None,
+    simulate: bool,
+) -> Solution:
     region = problem.plant.region
     if not method.stay_inside or region is None or not region.whitening.size:
         return solution_of(problem, solve_meshes(problem, method, guess), simulate)

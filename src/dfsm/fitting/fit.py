@@ -22,6 +22,7 @@ from dfsm.core.hand_back import hand_back
 from dfsm.core.host import from_host
 from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
+from dfsm.core.version import __version__
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import kinematic_rows
 from dfsm.data.readers.rotor_table import RotorTable
@@ -419,7 +420,11 @@ def _record(
         "window_samples": f.samples.tolist(),
         "checks": checks,
         "warnings": notes,
-        "versions": {name: version(name) for name in ("dfsm", "jax", "numpy", "scipy")},
+        "versions": {
+            # Not its metadata: dfsm may lie on the path without being installed.
+            "dfsm": __version__,
+            **{name: version(name) for name in ("jax", "numpy", "scipy")},
+        },
         "seconds": dict(seconds),
     }
 

@@ -14,9 +14,8 @@ from dfsm.core.drawing import DrawnByRun
 from dfsm.core.files import json_value
 from dfsm.core.types import Array
 from dfsm.loops.tuning_problem import TuningProblem
-from dfsm.models.departures import told
+from dfsm.models.departures import MUCH_OUTSIDE, told
 from dfsm.simulation.closed_loop import ClosedLoopRun
-from dfsm.simulation.outcome import MUCH_OUTSIDE
 
 # Share of a parameter's bounds within which it is at one of them.
 _AT_BOUND = 1e-3

@@ -19,6 +19,8 @@ from dfsm.models.region import Region
 from dfsm.numerics.hats import hat_weights
 from dfsm.numerics.time_mesh import mean_over
 
+# Share of the time outside the training data above which a user is warned.
+MUCH_OUTSIDE = 0.05
 # Standard deviation of a constant, over its size: rounding.
 _CONSTANT = 1e-9
 # How many are named in one sentence.

@@ -27,7 +27,7 @@ from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
-from dfsm.models.departures import Departure, departures, told
+from dfsm.models.departures import MUCH_OUTSIDE, Departure, departures, told
 from dfsm.models.dfsm import DFSM
 from dfsm.models.staged import staged
 from dfsm.simulation.drawn_run import DrawnRun
@@ -39,7 +39,7 @@ from dfsm.simulation.loop_cases import (
     padded,
     prepared_cases,
 )
-from dfsm.simulation.outcome import ESCAPE, MUCH_OUTSIDE
+from dfsm.simulation.outcome import ESCAPE
 from dfsm.simulation.wires import Wires, connect, not_commanded
 
 # What is kept of a closed loop.

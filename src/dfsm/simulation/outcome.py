@@ -15,7 +15,7 @@ from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmWarning, printable
-from dfsm.models.departures import Departure, departures, told
+from dfsm.models.departures import MUCH_OUTSIDE, Departure, departures, told
 from dfsm.models.dfsm import DFSM
 from dfsm.models.region import Region
 from dfsm.models.signals import SignalTable
@@ -25,8 +25,6 @@ from dfsm.simulation.integrate import Rollout
 
 # A rollout ends where a state is this many times its training half-range from the middle.
 ESCAPE = 10.0
-# Share of the time outside the training range above which a user is warned.
-MUCH_OUTSIDE = 0.05
 
 
 class Status(enum.Enum):

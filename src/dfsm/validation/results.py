@@ -13,11 +13,11 @@ from dfsm.core.files import json_value
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import printable
-from dfsm.models.departures import told
+from dfsm.models.departures import MUCH_OUTSIDE, told
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.spectra import Spectrum
 from dfsm.numerics.time_mesh import mean_over, std_over
-from dfsm.simulation.outcome import MUCH_OUTSIDE, Simulation, Status
+from dfsm.simulation.outcome import Simulation, Status
 from dfsm.validation.intervals import Intervals
 
 if TYPE_CHECKING:
