@@ -232,8 +232,7 @@ def _series_section(name: str, results: Sequence[Result]) -> Section:
         note=(
             "Power: mean of η τ ω. dβ/dt: RMS. Outside: share of the horizon with an input beyond "
             "its training range, or a combination that did not occur there. Steps: of the solver; "
-            "time: with compilation; in case b on the last mesh, from the optimum on a coarser one. "
-            "Replay: "
+            "time: with compilation; case b from the optimum on fewer nodes, not counted. Replay: "
             "how far Θp is off at most when an adaptive integrator applies the controls with all "
             "samples of the wind. "
             "Where an optimum keeps a tighter Θp,max by itself, it stands there, too. "
