@@ -197,9 +197,10 @@ def optimize(
     model = region.own if case is PAPER else region.model
     horizon = (region.start, region.start + settings.duration)
     asked = problem(model, wind, case, most_pitch, horizon)
+    intervals = settings.points - 1
     method = DirectTranscription(
         scheme="trapezoidal",
-        mesh=settings.points - 1,
+        mesh=intervals,
         refine=None,
         tolerance=settings.tolerance,
         stay_inside=case.inside,
@@ -208,7 +209,7 @@ def optimize(
     with hushed():  # where it leaves the training data stands in the result
         if case.inside:
             # Its many steps cost a fraction on fewer nodes.
-            coarse = replace(method, mesh=max(2, method.mesh // _COARSER))
+            coarse = replace(method, mesh=max(2, intervals // _COARSER))
             guess = solve(asked, coarse, simulate=False)
         solution = solve(asked, method, guess if guess and guess.solved else None)
     run, names = solution.trajectory, [c.name for c in model.signals.inputs]

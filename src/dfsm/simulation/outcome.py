@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ class StrayedPath:
     signals: SignalTable
     driven: Trajectory
     states: Array
-    outside: NDArray[np.bool_]
+    outside: NDArray[Any]
 
     def departures(self) -> tuple[Departure, ...]:
         """Where it left the training range, those that lasted longest first."""
