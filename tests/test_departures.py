@@ -5,9 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+import dfsm
 from dfsm.data.trajectory import Channel
 from dfsm.models.departures import departures, told
 from dfsm.models.region import Region
+from dfsm.simulation import outcome
+from systems import linear_model
 
 CHANNELS = (Channel("Tq", "kN m"), Channel("valve", "%"), Channel("w", "rpm"))
 TIME = np.arange(0.0, 10.0, 0.1)
@@ -64,3 +67,19 @@ def test_a_control_that_stood_still_in_training_comes_first():
     )
     assert other.channels == ("Tq",)
     assert told((constant, other, other, other, other)).endswith("; and 2 more")
+
+
+def test_a_rollout_looks_for_departures_when_asked(monkeypatch):
+    """Of thousands of rollouts somebody reads the words of a few."""
+    model = linear_model(-np.eye(1), np.eye(1), span=1.0)
+    values = np.where(TIME < 0.25, 1.5, 0.0)[:, None] * [1.0, 0.0]
+    channels = (*model.signals.controls, *model.signals.states)
+    asked = []
+    monkeypatch.setattr(outcome, "departures", lambda *a: asked.append(a) or departures(*a))
+    result = dfsm.simulate(model, dfsm.Trajectory(TIME, values, channels))
+    assert 0 < result.outside < 0.05
+    assert not asked
+    (first,) = result.departures
+    assert str(first).startswith("u0 goes to 1.5")
+    assert result.departures is result.departures
+    assert len(asked) == 1
