@@ -88,19 +88,18 @@ def study(
     jobs: int | None = None,
     first: Callable[[Mapping[str, Result]], object] = lambda _: None,
 ) -> dict[str, Result]:
-    """Fit the models, or some of them, and validate each on its test runs, so many at a time.
+    """Fit the models, or some of them, and validate each on its test runs.
 
-    `first` is called with the models that are not refined once all of these are there.
+    Those that are not refined come first, so many at a time; `first` is called with them.
     """
-    # The quick ones go first, and may be looked at while the others are fitted.
-    tasks = sorted(labels, key=lambda label: label == REFINED)
-    fits: dict[str, Result] = {}
-    work = work_through(fit_and_validate, None, tasks, jobs or processors())
-    for label, result in track(work, "models", len(tasks)):
-        fits[label] = result
-        quick = [name for name in labels if name != REFINED]
-        if label in quick and all(name in fits for name in quick):
-            first({name: fits[name] for name in quick})
+    quick, fits = [label for label in labels if label != REFINED], dict[str, Result]()
+    # Refinement takes all processors by itself.
+    rest = [label for label in labels if label == REFINED]
+    for some, at_once in ((quick, jobs or processors()), (rest, 1)):
+        work = work_through(fit_and_validate, None, some, at_once)
+        fits |= track(work, "models", len(some))
+        if some and some is quick:
+            first(dict(fits))
     return {label: fits[label] for label in labels}
 
 
