@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
 from cart import problem, solved, wind
+from conftest import write_config as write_yaml
 from dfsm.config.fit import Config
 from dfsm.config.parse import parse_file
 from dfsm.config.template import write_config
@@ -24,6 +25,7 @@ from dfsm.exports.rosco import write_rosco
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
 from dfsm.fitting.settings import FitSettings
+from dfsm.models.model_folder import save
 from dfsm.report.solution_page import outcome
 from dfsm.simulators import ODESystem
 
@@ -96,7 +98,7 @@ def test_what_cannot_be_held_is_a_sentence():
         problem(model=system, inputs={"a": "hold"}, disturbances=None, **none)
 
 
-def test_a_control_that_was_held_in_training_is_told(tmp_path):
+def test_a_control_that_was_held_in_training_is_told(tmp_path, dfsm):
     rng = np.random.default_rng(0)
     u, decay, x = np.repeat(rng.uniform(-1, 1, 60), 4), np.exp(-0.3), np.zeros(240)
     for k in range(239):
@@ -114,6 +116,13 @@ def test_a_control_that_was_held_in_training_is_told(tmp_path):
     with pytest.warns(DfsmWarning, match="'u' was held between samples in the runs of the model"):
         solve(problem(**task), replace(RADAU, mesh=4, refine=None), simulate=False)
     assert plant_of(model).names("controls") == ("u",)
+    save(model, tmp_path / "m")
+    cost = [{"square": "u", "weight": 1.0}]
+    asked = {"model": str(tmp_path / "m"), "horizon": [0.0, 4.0], "nodes": 5, "cost": cost}
+    asked = write_yaml(tmp_path / "problem.yaml", asked | {"initial": "free"})
+    told = dfsm("optimize", asked, "-o", tmp_path / "found")
+    assert told.code == 0, told
+    assert "'u' was held between samples in the runs of the model" in told.err
     found = solved(problem(**task, inputs={"u": "hold"}), replace(RADAU, mesh=4))
     # x₄ = Σ decay^(3-k) (1 - decay) u_k, with least Σ u².
     row = (1 - decay) * decay ** np.arange(3.0, -1, -1)

@@ -18,19 +18,17 @@ def optimize(
 ) -> None:
     """Find the controls that minimise a cost, for a known course of the disturbances."""
     from dfsm.config.control import load_problem
-    from dfsm.control import solve
     from dfsm.control.solution_folder import PAGE, check_solution_target, save_solution
+    from dfsm.control.solve import optimum
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.lock import locked
-    from dfsm.errors import hushed
     from dfsm.report.solution_page import solution_article, write_solution_report
 
     check_solution_target(output)
     with locked(output):
         with working(quiet):
             problem, method, guess = load_problem(config)
-            with hushed():  # what it says stands in the summary
-                solution = solve(problem, method, guess)
+            solution = optimum(problem, method, guess)  # the summary tells where it is outside
         write_or_keep(lambda path: save_solution(solution, path, write_solution_report), output)
     article = solution_article(solution)
     if as_json:

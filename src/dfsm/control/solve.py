@@ -61,7 +61,7 @@ def solve(
     DfsmWarning
         An optimum of a surrogate is outside its training data for part of the horizon.
     """
-    solution = _solved(problem, method or DirectTranscription(), guess, simulate)
+    solution = optimum(problem, method, guess, simulate)
     if solution.solved and (solution.outside or 0.0) > MUCH_OUTSIDE:
         where = "; ".join(solution.departures)
         advice = "" if method and method.stay_inside else "; stay_inside keeps it near the data"
@@ -74,12 +74,14 @@ def solve(
     return solution
 
 
-def _solved(
+def optimum(
     problem: OptimalControlProblem,
-    method: Method,
-    guess: Solution | Trajectory | None,
-    simulate: bool,
+    method: Method | None = None,
+    guess: Solution | Trajectory | None = None,
+    simulate: bool = True,
 ) -> Solution:
+    """As `solve`, for whoever tells by other means that an optimum is outside the training data."""
+    method = method or DirectTranscription()
     region = problem.plant.region
     if not method.stay_inside or region is None or not region.whitening.size:
         return solution_of(problem, solve_meshes(problem, method, guess), simulate)

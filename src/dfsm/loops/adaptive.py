@@ -19,7 +19,7 @@ from dfsm.control.names import End, Signals
 from dfsm.control.nlp.shot import Method
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.solution import Ending, Solution
-from dfsm.control.solve import solve
+from dfsm.control.solve import optimum
 from dfsm.core.drawing import Engine, Shown, draw
 from dfsm.core.host import from_host
 from dfsm.core.progress import track
@@ -27,7 +27,7 @@ from dfsm.core.renamed import renamed
 from dfsm.core.settings import require, settings_class
 from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
-from dfsm.errors import DfsmError, hushed, printable
+from dfsm.errors import DfsmError, printable
 from dfsm.models.dfsm import DFSM
 
 # Share of the cost up to which the price of a miss is taken to be of first order.
@@ -227,12 +227,11 @@ def optimize_adaptively(
         models.append(fit(list(runs)))
         asked = problem(models[-1])
         require(len(asked.scenarios) == 1, "scenarios", len(asked.scenarios), "one")
-        with hushed():  # the next model is fitted where this optimum went
-            solution = solve(asked, settings.method, guess)
-            interrupted = solution.ending is Ending.INTERRUPTED
-            if not solution.solved and guess is not None and not interrupted:
-                # The last optimum of a poor surrogate can be a worse start than none.
-                solution = solve(asked, settings.method)
+        # Outside the training data or not: the next model is fitted where this optimum went.
+        solution = optimum(asked, settings.method, guess)
+        if not solution.solved and guess is not None and solution.ending is not Ending.INTERRUPTED:
+            # The last optimum of a poor surrogate can be a worse start than none.
+            solution = optimum(asked, settings.method)
         rounds.append(_round(asked, solution, simulator))
         runs.append(rounds[-1].run)
         guess = solution if solution.solved else None
