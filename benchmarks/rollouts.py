@@ -241,10 +241,8 @@ def sweep(model: dfsm.DFSM) -> dict[str, Any]:
     s, region = model.signals, model.region
     columns, observed = s.observed_columns, len(s.observed)
     low, high, std = (np.asarray(a)[columns] for a in (region.low, region.high, region.std))
-    grid, operating = np.asarray(region.grid), np.asarray(region.operating)
     results = {}
-    for wind in SWEEP:
-        point = np.array([np.interp(wind, grid, v) for v in operating.T])
+    for wind, point in zip(SWEEP, region.usual(np.array(SWEEP)), strict=True):
         values = dict(zip((c.name for c in s.inputs), point, strict=True))
         run = _constant(model, values | {"RotWind": wind, "Wave1Elev": 0.0})
         rollout = dfsm.simulate(model, run, initial=point[columns])

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dfsm.control import DirectTranscription, Solution, solve
+from dfsm.control import DirectTranscription, Solution
+from dfsm.control.solve import optimum
 from dfsm.core.progress import track
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.core.workers import work_through
 from dfsm.data.trajectory import Trajectory
-from dfsm.errors import hushed
 from dfsm.models.dfsm import DFSM
 from turbine_problem import (
     BLADE,
@@ -206,12 +206,12 @@ def optimize(
         stay_inside=case.inside,
     )
     guess = None
-    with hushed():  # where it leaves the training data stands in the result
-        if case.inside:
-            # Its many steps cost a fraction on fewer nodes.
-            coarse = replace(method, mesh=max(2, intervals // _COARSER))
-            guess = solve(asked, coarse, simulate=False)
-        solution = solve(asked, method, guess if guess and guess.solved else None)
+    if case.inside:
+        # Its many steps cost a fraction on fewer nodes.
+        coarse = replace(method, mesh=max(2, intervals // _COARSER))
+        guess = optimum(asked, coarse, simulate=False)
+    # Where it leaves the training data stands in the result.
+    solution = optimum(asked, method, guess if guess and guess.solved else None)
     run, names = solution.trajectory, [c.name for c in model.signals.inputs]
     beyond = np.asarray(model.region.beyond(run.select(names).values)).mean(axis=0)
     outside = {n: float(v) for n, v in zip(names, beyond, strict=True) if v > 0}
@@ -314,8 +314,7 @@ def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:
     tuple of float
         In rpm per MN m and in rpm per deg.
     """
-    s, grid = model.signals, np.asarray(model.region.grid)
-    point = np.array([np.interp(wind, grid, v) for v in np.asarray(model.region.operating).T])
+    s, (point,) = model.signals, model.region.usual(np.array([wind]))
     A, B, _, _ = model.jacobians(*model.split(point))
     gain = -np.linalg.solve(A, B)
     row = gain[[c.name for c in s.states].index(SPEED)]

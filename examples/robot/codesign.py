@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from dfsm.control import DirectTranscription, End, OptimalControlProblem, Signals, Solution, solve
+from dfsm.control.solve import optimum
 from dfsm.core.settings import settings_class
 from dfsm.data.derivatives import StateSpec
 from dfsm.data.trajectory import Trajectory
@@ -122,8 +123,8 @@ def study(settings: CodesignSettings | None = None, seed: int = 0) -> Codesign:
     """
     settings = settings or CodesignSettings()
     runs = training_runs(settings, seed)
-    with hushed():  # what its departures cost is measured below, on the arm itself
-        solution = solve(problem(surrogate(runs, settings.corrective)), METHOD)
+    # What its departures cost is measured below, on the arm itself.
+    solution = optimum(problem(surrogate(runs, settings.corrective)), METHOD)
     truth = solve(problem(ARM), METHOD)
     best = solution.parameters["m2"]
     split = {mass: _cost(mass) for mass in np.linspace(*MASSES, 5).tolist()}
