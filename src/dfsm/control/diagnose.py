@@ -124,10 +124,7 @@ def require_finite(
     DfsmError
         Names the function and the first time.
     """
-    slopes = [
-        b.term.jacobian(program.physical(z)[b.columns], b.data, b.common) for b in program.blocks
-    ]
-    for values, kind in ((program.outputs(z), ""), (slopes, "the slope of ")):
+    for values, kind in ((program.outputs(z), ""), (program.slopes(z), "the slope of ")):
         for block, (array, labels) in enumerate(zip(values, names, strict=True)):
             finite = np.isfinite(array.reshape(len(array), len(labels), -1))
             bad = np.logical_not(finite.all(axis=2))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -196,9 +197,9 @@ class Signals:
         groups = [jnp.asarray(g) for g in self._raw]
         return region.distance_chosen(order.join(*groups), order.element(region.schedule, *groups))
 
-    @property
+    @cached_property
     def y(self) -> Group:
-        """Outputs; they are only evaluated where a function asks for them."""
+        """Outputs; they are only evaluated where a function asks for them, and once."""
         return Group("y", self._plant, self._plant.output(*self._raw))
 
 

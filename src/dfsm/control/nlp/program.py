@@ -107,6 +107,8 @@ class Program:
         self.linear_quadratic = False
         # The solver sees the objective times this.
         self.objective_scale = 1.0
+        self._active, self._affine = zip(*map(self._split, self.blocks), strict=True)
+        self._slopes_affine: list[Array] = []
         self._jacobian_structure()
         self._hessian_structure()
         self._at: dict[str, tuple[bytes, Any]] = {}
@@ -121,23 +123,33 @@ class Program:
 
     # -- structure ------------------------------------------------------------------------------
 
+    def _split(self, b: Block) -> tuple[IntArray, IntArray]:
+        """Elements of a block's local vector that move: those it is not affine in, and others.
+
+        With the others its Jacobian is constant and its Hessian zero; what cannot move needs none.
+        """
+        moves = (self.lower < self.upper)[b.columns].any(axis=0)
+        curved = b.term.curved(self.scale[b.columns], b.data, b.common)
+        return np.flatnonzero(moves & curved), np.flatnonzero(moves & ~curved)
+
     def _jacobian_structure(self) -> None:
         base = self.G0.tocoo()
         rows, columns, parts = [base.row], [base.col], []
         self._gradients = []
-        for b in self.blocks:
-            count, local = b.columns.shape
+        for b, *elements in zip(self.blocks, self._active, self._affine, strict=True):
+            at = b.columns[:, np.concatenate(elements)]
+            count, local = at.shape
             outputs = len(b.c) // count
             G = b.G.tocoo()
             row = np.repeat(G.row, local)
-            column = b.columns[G.col // outputs].ravel()
+            column = at[G.col // outputs].ravel()
             source = (G.col[:, None] * local + np.arange(local)).ravel()
             value = np.repeat(G.data / self.row_scale[G.row], local) * self.scale[column]
             rows.append(row)
             columns.append(column)
             parts.append((source, value, count * outputs * local))
             used = np.flatnonzero(b.c)
-            to = b.columns[used // outputs].ravel()
+            to = at[used // outputs].ravel()
             source = (used[:, None] * local + np.arange(local)).ravel()
             value = np.repeat(b.c[used], local) * self.scale[to]
             shape = (self.n, count * outputs * local)
@@ -152,22 +164,26 @@ class Program:
 
     def _hessian_structure(self) -> None:
         rows, columns, parts = [], [], []
-        for b in self.blocks:
-            count, local = b.columns.shape
+        for b, active, affine in zip(self.blocks, self._active, self._affine, strict=True):
+            at = b.columns[:, np.concatenate([active, affine])]
+            (count, local), width = at.shape, len(active)
             i, j = np.triu_indices(local)
-            first, second = b.columns[:, i], b.columns[:, j]
-            source = np.arange(count)[:, None] * local**2 + i * local + j
+            first, second = at[:, i], at[:, j]
+            # Zeros have their places, too: on some problems without a solution the solver only
+            # finds that there is none with blocks that are full.
+            computed = np.broadcast_to(j < width, first.shape)
+            source = np.arange(count)[:, None] * width**2 + i * width + j
             # An entry off the diagonal of a block may lie on that of the whole.
             twice = np.where((first == second) & (i != j), 2.0, 1.0)
             value = twice * self.scale[first] * self.scale[second]
             rows.append(np.minimum(first, second).ravel())
             columns.append(np.maximum(first, second).ravel())
-            parts.append((source.ravel(), value.ravel(), count * local**2))
+            parts.append((computed.ravel(), source[computed], value[computed], count * width**2))
         self.hessian_pattern, places = _pattern(rows, columns, self.n, self.n)
         size = len(self.hessian_pattern[0])
         self._hessians = [
-            sparse.csr_matrix((value, (place, source)), shape=(size, width))
-            for place, (source, value, width) in zip(places, parts, strict=True)
+            sparse.csr_matrix((value, (place[computed], source)), shape=(size, width))
+            for place, (computed, source, value, width) in zip(places, parts, strict=True)
         ]
 
     # -- evaluation -----------------------------------------------------------------------------
@@ -199,8 +215,8 @@ class Program:
         return self.G0 @ z + total / self.row_scale
 
     def gradient(self, z: Array) -> Array:
-        """Return ∂f/∂z, scaled, shape ``(variable,)``."""
-        return self.objective_scale * self._slopes(z)
+        """Return ∂f/∂z, scaled, shape ``(variable,)``; 0 for what cannot move."""
+        return self.objective_scale * self._gradient(z)
 
     def variation(self, z: Array) -> float:
         """How much f in physical units depends on the variables that can move, to first order.
@@ -208,34 +224,56 @@ class Program:
         ½ Σ |zᵢ ∂f/∂zᵢ|: the value of a quadratic cost, whatever constant is added to it.
         """
         moves = self.lower < self.upper
-        return 0.5 * float(np.abs(z * self._slopes(z))[moves].sum())
+        return 0.5 * float(np.abs(z * self._gradient(z))[moves].sum())
 
-    def _slopes(self, z: Array) -> Array:
-        parts = zip(self._gradients, self._derivatives(z), strict=True)
-        return sum((M @ J for M, J in parts), np.zeros(self.n))
+    def _gradient(self, z: Array) -> Array:
+        parts = zip(self._gradients, self.slopes(z), strict=True)
+        return sum((M @ J.ravel() for M, J in parts), np.zeros(self.n))
 
     def jacobian(self, z: Array) -> Array:
-        """Values of ∂g/∂z in the order of `jacobian_pattern`."""
-        parts = zip(self._jacobians, self._derivatives(z), strict=True)
-        return sum((M @ J for M, J in parts), self._jacobian_fixed)
+        """Values of ∂g/∂z in the order of `jacobian_pattern`, for what can move."""
+        parts = zip(self._jacobians, self.slopes(z), strict=True)
+        return sum((M @ J.ravel() for M, J in parts), self._jacobian_fixed)
 
     def hessian(self, z: Array, sigma: float, multipliers: Array) -> Array:
         """Upper triangle of ∂²(σ f + λᵀ g)/∂z² in the order of `hessian_pattern`."""
         x, weights = self.physical(z), multipliers / self.row_scale
         sigma = sigma * self.objective_scale
         total = np.zeros(len(self.hessian_pattern[0]))
-        for b, M in zip(self.blocks, self._hessians, strict=True):
+        for b, active, M in zip(self.blocks, self._active, self._hessians, strict=True):
+            if not active.size:
+                continue
             local = x[b.columns]
             w = (sigma * b.c + b.G.T @ weights).reshape(len(local), -1)
-            total += M @ b.term.hessian(local, b.data, b.common, w).ravel()
+            total += M @ b.term.hessian(local, b.data, b.common, w, active).ravel()
         return total
 
-    def _derivatives(self, z: Array) -> list[Array]:
+    def slopes(self, z: Array) -> list[Array]:
+        """Jacobians of every block with all of its elements that move, ``(row, output, moving)``.
+
+        Those in which it is not affine come first.
+        """
+
         def compute() -> list[Array]:
             x = self.physical(z)
-            return [b.term.jacobian(x[b.columns], b.data, b.common).ravel() for b in self.blocks]
+            if not self._slopes_affine:
+                self._slopes_affine = self._slopes_of(self._affine, x)
+            both = zip(self._slopes_of(self._active, x), self._slopes_affine, strict=True)
+            return [np.concatenate(parts, axis=2) for parts in both]
 
-        return self._once("jacobians", z, compute)
+        return self._once("slopes", z, compute)
+
+    def _slopes_of(self, elements: Sequence[IntArray], x: Array) -> list[Array]:
+        """Jacobians of every block with some elements, ``(row, output, element)``."""
+        slopes = []
+        for b, of in zip(self.blocks, elements, strict=True):
+            rows = len(b.columns)
+            slopes.append(
+                b.term.jacobian(x[b.columns], b.data, b.common, of)
+                if of.size
+                else np.zeros((rows, len(b.c) // rows, 0))
+            )
+        return slopes
 
     def _once(self, what: str, z: Array, compute: Any) -> Any:
         """Compute at a new point, remember at the last one: the solver asks for f and g apart."""

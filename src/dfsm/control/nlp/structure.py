@@ -1,7 +1,7 @@
 """Which outputs of traced code depend on an argument, value by value.
 
-That is how linear-quadratic problems are recognised, and constraints on which no choice has an
-effect.
+That is how linear-quadratic problems are recognised, constraints on which no choice has an effect,
+and variables in which everything is linear.
 """
 
 from __future__ import annotations
@@ -93,6 +93,34 @@ def dependent(function: Callable[..., Any], first: Any, *rest: Any) -> list[Bool
     count = len(jax.tree.leaves(first))
     masks = [_all(v, i < count) for i, v in enumerate(closed.jaxpr.invars)]
     return _follow(closed.jaxpr, masks)
+
+
+def curved(function: Callable[..., Any], first: Any, *rest: Any) -> BoolArray:
+    """In which elements of its first argument a function is not affine.
+
+    Those on which its gradient depends; a False is a proof, see `dependent`.
+
+    Parameters
+    ----------
+    function
+        Gives one number; traceable by JAX.
+    first
+        Example of the vector in question.
+    rest
+        Examples of the other arguments.
+
+    Returns
+    -------
+    ndarray
+        Shape ``(element,)``.
+    """
+    closed = jax.make_jaxpr(jax.grad(function))(first, *rest)
+    others = [_all(v, False) for v in closed.jaxpr.invars[1:]]
+    found = [
+        any(mask.any() for mask in _follow(closed.jaxpr, [one, *others]))
+        for one in np.eye(len(first), dtype=bool)
+    ]
+    return np.array(found, dtype=bool)
 
 
 def _all(variable: Any, value: bool) -> BoolArray:

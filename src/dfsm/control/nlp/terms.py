@@ -7,7 +7,8 @@ and problems that differ only in numbers (bounds, disturbances, mesh) share the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.control.levels import is_number
 from dfsm.control.names import End, Signals
-from dfsm.control.nlp.structure import dependent, varies
+from dfsm.control.nlp.structure import curved, dependent, varies
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.host import from_host
 from dfsm.core.types import Array
@@ -33,6 +34,7 @@ _MOST = 32
 _KNOWN: dict[tuple, Functions] = {}
 
 Local = Callable[[jax.Array, Any, Any], jax.Array]
+Elements = tuple[int, ...]
 
 
 class Term:
@@ -51,25 +53,54 @@ class Term:
         def weighted(z: jax.Array, data: Any, common: Any, weights: jax.Array) -> jax.Array:
             return weights @ function(z, data, common)
 
-        rows = (0, 0, None)
+        def jacobian(of: Elements, z: jax.Array, data: Any, common: Any) -> jax.Array:
+            chosen, local = _among(of, z)
+            outputs = jax.eval_shape(function, z, data, common).shape[0]
+            slopes = jax.jacfwd if len(of) <= outputs else jax.jacrev
+            return slopes(lambda c: function(local(c), data, common))(chosen)
+
+        def hessian(of: Elements, z: jax.Array, *rest: Any) -> jax.Array:
+            chosen, local = _among(of, z)
+            return jax.jacfwd(jax.grad(lambda c: weighted(local(c), *rest)))(chosen)
+
+        def rows(part: Callable[..., jax.Array], axes: tuple) -> Callable[..., jax.Array]:
+            every = lambda of, *a: jax.vmap(partial(part, of), axes)(*a)  # noqa: E731
+            return jax.jit(every, static_argnums=0)
+
         self.parts = parts
-        self._values = jax.jit(jax.vmap(function, rows))
-        # Measured: backwards a third of the time for hundreds of units; forwards through loops.
-        slopes = jax.jacfwd if parts is None else jax.jacrev
-        self._jacobian = jax.jit(jax.vmap(slopes(function), rows))
-        self._hessian = jax.jit(jax.vmap(jax.jacfwd(jax.grad(weighted)), (*rows, 0)))
+        self._function, self._weighted = function, weighted
+        self._values = jax.jit(jax.vmap(function, (0, 0, None)))
+        self._jacobian, self._hessian = rows(jacobian, (0, 0, None)), rows(hessian, (0, 0, None, 0))
+        self._curved: NDArray[np.bool_] | None = None
 
     def values(self, z: Array, data: Any, common: Any) -> Array:
         """Outputs ``(row, output)`` at local vectors ``(row, local)``."""
         return self._padded(self._values, common, z, data)
 
-    def jacobian(self, z: Array, data: Any, common: Any) -> Array:
-        """Jacobians ``(row, output, local)``."""
-        return self._padded(self._jacobian, common, z, data)
+    def jacobian(self, z: Array, data: Any, common: Any, of: Sequence[int]) -> Array:
+        """Jacobians with some elements of the local vector, at least one: ``(row, output, of)``."""
+        return self._padded(partial(self._jacobian, _elements(of)), common, z, data)
 
-    def hessian(self, z: Array, data: Any, common: Any, weights: Array) -> Array:
-        """Hessians of the outputs times weights ``(row, output)``, ``(row, local, local)``."""
-        return self._padded(self._hessian, common, z, data, weights)
+    def hessian(
+        self, z: Array, data: Any, common: Any, weights: Array, of: Sequence[int]
+    ) -> Array:
+        """Hessians of the outputs times weights ``(row, output)``, ``(row, of, of)``.
+
+        `of` are some elements of the local vector, at least one.
+        """
+        return self._padded(partial(self._hessian, _elements(of)), common, z, data, weights)
+
+    def curved(self, z: Array, data: Any, common: Any) -> NDArray[np.bool_]:
+        """In which elements of the local vector any output is not affine, ``(local,)``.
+
+        With the others all Jacobians are constant. Proved on the traced code; a True may be
+        overcautious.
+        """
+        if self._curved is None:
+            one = (z[0], jax.tree.map(lambda a: a[0], data), common)
+            outputs = jax.eval_shape(self._function, *one).shape
+            self._curved = curved(self._weighted, *one, from_host(np.ones(outputs)))
+        return self._curved
 
     def is_quadratic(self, z: Array, data: Any, common: Any) -> bool:
         """Whether the objective is at most quadratic and the constraints are affine.
@@ -98,6 +129,20 @@ class Term:
             part = jax.tree.map(lambda a, k=first: a[k : k + size], padded)
             blocks.append(np.asarray(function(part[0], part[1], common, *part[2:])))
         return (blocks[0] if len(blocks) == 1 else np.concatenate(blocks))[:count]
+
+
+def _elements(of: Sequence[int]) -> Elements:
+    return tuple(int(i) for i in of)
+
+
+def _among(of: Elements, z: jax.Array) -> tuple[jax.Array, Callable[[jax.Array], jax.Array]]:
+    """Some elements of a vector, and the vector as a function of these."""
+    place = {i: k for k, i in enumerate(of)}
+
+    def local(chosen: jax.Array) -> jax.Array:
+        return jnp.stack([chosen[place[i]] if i in place else v for i, v in enumerate(z)])
+
+    return jnp.stack([z[i] for i in of]), local
 
 
 def block_length(count: int) -> int:

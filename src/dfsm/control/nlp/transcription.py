@@ -213,10 +213,9 @@ class Transcription(Shot):
         local, data = self._local(X, U, start, tau)
         node, common = self.functions.node, self.common
         flat = weights.reshape(len(local), -1)
-        own = slice(X.shape[2], X.shape[2] + U.shape[2])
-        slope = np.einsum("ro,roc->rc", flat, node.jacobian(local, data, common)[:, :, own])
-        second = node.hessian(local, data, common, flat)
-        curve = np.diagonal(second, axis1=1, axis2=2)[:, own]
+        own = np.arange(X.shape[2], X.shape[2] + U.shape[2])
+        slope = np.einsum("ro,roc->rc", flat, node.jacobian(local, data, common, own))
+        curve = np.diagonal(node.hessian(local, data, common, flat, own), axis1=1, axis2=2)
         return slope.reshape(U.shape), curve.reshape(U.shape)
 
     def _local(self, X: Array, U: Array, start: Start, tau: Array) -> tuple[Array, dict[str, Any]]:

@@ -57,7 +57,8 @@ class Term(eqx.Module):
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """The values at one input vector, shape ``(input,)`` to ``(value,)``."""
-        return self.values(inputs[np.array(self.columns, dtype=int)])
+        # One by one: of a gather nobody can tell on which inputs its values depend.
+        return self.values(jnp.stack([inputs[column] for column in self.columns]))
 
     def of_numbers(self, signals: Sequence[jax.Array]) -> jax.Array:
         """The values of single numbers, one per signal; `values` but for the last digits.
