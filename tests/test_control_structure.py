@@ -11,7 +11,8 @@ import pytest
 
 from cart import CART, QUICK, problem, solved
 from dfsm.control import solve
-from dfsm.control.nlp.structure import dependent, varies
+from dfsm.control.guess import start_of
+from dfsm.control.nlp.structure import curved, dependent, varies
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 
@@ -105,3 +106,37 @@ def test_masks_follow_places():
 def test_slopes_tell_linear_from_curved():
     assert not varies(jax.jacfwd(lambda z: 3 * z[0] - z[1]), jnp.ones(2))
     assert varies(jax.jacfwd(lambda z: z[0] * z[1]), jnp.ones(2))
+
+
+def test_elements_in_which_a_function_is_affine_are_proved():
+    def function(z, fixed):
+        return fixed * z[0] + z[1] ** 2 + jnp.sin(fixed) * z[2] * z[3] + z[4]
+
+    np.testing.assert_array_equal(curved(function, jnp.ones(5), 2.0), [0, 1, 1, 1, 0])
+    # Of a gather nobody can tell.
+    assert curved(lambda z: z[jnp.array([1])][0] ** 2, jnp.ones(2)).all()
+    affine = lambda z: jnp.array([[1.0, 2.0]]) @ jnp.stack([z[1], z[0]]) + 3  # noqa: E731
+    assert not curved(lambda z: affine(z)[0], jnp.ones(2)).any()
+
+
+def test_constant_slopes_are_computed_once_and_what_cannot_move_has_none():
+    # The mass is fixed, the place enters nothing, speed and force only the power.
+    limited = problem(bounds={"power": (-9.0, 9.0)})
+    shot = QUICK.shot(limited, QUICK.grid(), start_of(limited, None, QUICK.grid().tau))
+    term, asked = shot.program.blocks[0].term, []
+    original = term.jacobian
+
+    def counted(z, data, common, of):
+        asked.append(tuple(of))
+        return original(z, data, common, of)
+
+    term.jacobian = counted
+    z = np.ones(shot.program.n)
+    first, second = (shot.program.slopes(point)[0] for point in (z, 2 * z))
+    del term.jacobian
+    assert asked == [(0,), (1, 2), (1, 2)]
+    np.testing.assert_array_equal(first[..., 2], second[..., 2])
+    local = np.asarray(z * shot.program.scale)[shot.program.blocks[0].columns]
+    b = shot.program.blocks[0]
+    whole = original(local, b.data, b.common, (1, 2, 0))
+    np.testing.assert_allclose(first, whole, rtol=1e-14)

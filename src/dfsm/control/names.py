@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.dfsm import DFSM
 from dfsm.models.inputs import InputOrder
+from dfsm.models.point import Point
 from dfsm.models.region import Region
 from dfsm.simulators import ODESystem
 from dfsm.simulators.evaluate import Function, as_jax
@@ -45,6 +46,9 @@ class Plant:
         Channels by group, ``"states"`` to ``"outputs"``.
     derivative, output
         ``(x, u, w, p)`` to one vector; traceable by JAX.
+    at
+        ``(x, u, w, p)`` to an object with both vectors as `derivative` and `output`, which computes
+        what they share once.
     region
         Where the training data of a surrogate lie, on inputs [u, w, ξ, p]; None for an `ODESystem`.
     """
@@ -52,6 +56,7 @@ class Plant:
     channels: Mapping[str, tuple[Channel, ...]]
     derivative: Callable[..., Any]
     output: Callable[..., Any]
+    at: Callable[..., Any]
     region: Region | None
 
     def names(self, group: str) -> tuple[str, ...]:
@@ -103,7 +108,8 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
         _require_prompt_controls(model)
         channels = {g: tuple(getattr(model.signals, g)) for g in GROUPS.values()}
         ready = model.prepared()
-        return Plant(channels, ready.derivative, ready.output, model.region)
+        point = partial(Point, ready)
+        return Plant(channels, ready.derivative, ready.output, point, model.region)
     if not isinstance(model, ODESystem):
         raise DfsmError(
             f"model is a {type(model).__name__}, expected a DFSM or an ODESystem: wrap a function "
@@ -115,7 +121,8 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
             "give: write f with jax.numpy and set backend to jax"
         )
     channels = {g: tuple(getattr(model, g)) for g in GROUPS.values()}
-    return Plant(channels, _AsArray(model.f), _AsArray(model.g), None)
+    f, g = _AsArray(model.f), _AsArray(model.g)
+    return Plant(channels, f, g, partial(_SystemPoint, f, g), None)
 
 
 def _require_prompt_controls(model: DFSM) -> None:
@@ -140,6 +147,23 @@ class _AsArray:
 
     def __call__(self, x: Any, u: Any, w: Any, p: Any) -> Any:
         return jnp.zeros(0) if self.function is None else as_jax(self.function(x, u, w, p))
+
+
+class _SystemPoint:
+    """A system at one point, see `Plant.at`."""
+
+    def __init__(self, f: _AsArray, g: _AsArray, *groups: Any) -> None:
+        self._f, self._g, self._groups = f, g, groups
+
+    @cached_property
+    def derivative(self) -> Any:
+        """f, shape ``(state,)``."""
+        return self._f(*self._groups)
+
+    @cached_property
+    def output(self) -> Any:
+        """g, shape ``(output,)``."""
+        return self._g(*self._groups)
 
 
 class Group:
@@ -198,9 +222,18 @@ class Signals:
         return region.distance_chosen(order.join(*groups), order.element(region.schedule, *groups))
 
     @cached_property
+    def _point(self) -> Any:
+        return self._plant.at(*map(jnp.asarray, self._raw))
+
+    @property
     def y(self) -> Group:
         """Outputs; they are only evaluated where a function asks for them, and once."""
-        return Group("y", self._plant, self._plant.output(*self._raw))
+        return Group("y", self._plant, self._point.output)
+
+    @property
+    def derivative(self) -> Any:
+        """All state derivatives per second, shape ``(state,)``."""
+        return self._point.derivative
 
 
 class End:

@@ -13,9 +13,10 @@ from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.exports.program import Program
 from dfsm.exports.translate import UntranslatableError, translated
-from dfsm.models.dfsm import DFSM, functions_of_points
+from dfsm.models.dfsm import DFSM
 from dfsm.models.inputs import GROUPS as INPUTS
 from dfsm.models.latents import at_rest
+from dfsm.models.point import functions_of_points
 from dfsm.simulation.fastest import REACH, fastest_rates
 
 # The arguments of f and g, in this order.

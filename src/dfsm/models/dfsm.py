@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 # Samples evaluated at once.
 _BLOCK = 4096
 Row = Callable[..., jax.Array]
-PointFunction = Callable[..., jax.Array]
 
 
 class DFSM(eqx.Module):
@@ -119,7 +118,7 @@ class DFSM(eqx.Module):
         """
         order = self.signals.order
         groups = order.arrays(states, controls, disturbances, parameters)
-        return _evaluate(self, _derivative, groups, self.f.schedule)
+        return _evaluate(self, derivative_row, groups, self.f.schedule)
 
     def output(
         self,
@@ -157,9 +156,9 @@ class DFSM(eqx.Module):
         groups = order.arrays(states, controls, disturbances, parameters)
         if self.g is None:
             return from_host(np.zeros((*np.broadcast_shapes(*(a.shape[:-1] for a in groups)), 0)))
-        return _evaluate(self, _output, groups, self.g.schedule, self._harmonics(azimuth, field))
+        return _evaluate(self, output_row, groups, self.g.schedule, self.harmonics(azimuth, field))
 
-    def _harmonics(self, psi: ArrayLike | None, field: ArrayLike | None) -> jax.Array:
+    def harmonics(self, psi: ArrayLike | None, field: ArrayLike | None) -> jax.Array:
         """What ĝ takes beside I, shape ``(..., harmonic)``; zero, its mean, without an azimuth."""
         azimuth = self.signals.azimuth
         if azimuth is None or psi is None:
@@ -247,10 +246,10 @@ class DFSM(eqx.Module):
         if inputs.ndim != 1:
             raise DfsmError(f"jacobians are taken at one point, got shape {inputs.shape[:-1]}")
         xs, us = self.signals.state_columns, self.signals.order.driving_columns
-        J = np.asarray(_jacobian(self, _derivative, inputs))
+        J = np.asarray(_jacobian(self, derivative_row, inputs))
         extra = np.zeros(self._count_harmonics())
         G = (
-            np.asarray(_jacobian(self, _output, from_host(np.concatenate([inputs, extra]))))
+            np.asarray(_jacobian(self, output_row, from_host(np.concatenate([inputs, extra]))))
             if self.g is not None
             else np.empty((0, len(inputs)))
         )
@@ -328,19 +327,34 @@ class DFSM(eqx.Module):
         return None if column is None else self.signals.inputs[column].name
 
 
-def _derivative(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
-    wide = _with_terms(model, inputs)
+def derivative_row(
+    model: DFSM,
+    inputs: jax.Array,
+    value: jax.Array | None = None,
+    known: jax.Array | None = None,
+) -> jax.Array:
+    """f̂ at one input vector, ``(input,)`` to ``(state,)``.
+
+    `value` is the schedule's and `known` what the terms are there; None takes them from the inputs.
+    """
+    wide = _with_terms(model, inputs, known)
     return _sum((model.f, model.e, model.corrected), (wide, inputs), value)
 
 
-def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> jax.Array:
+def output_row(
+    model: DFSM,
+    inputs: jax.Array,
+    value: jax.Array | None = None,
+    known: jax.Array | None = None,
+) -> jax.Array:
+    """ĝ at one input vector with harmonics behind it, to ``(output,)``; see `derivative_row`."""
     if model.g is None:
         return jnp.zeros(0)
     n, azimuth = len(model.signals.inputs), model.signals.azimuth
     harmonics = inputs[n:]
     if azimuth is not None and azimuth.rings:
         inputs = inputs[:n]
-    wide = _with_terms(model, inputs)
+    wide = _with_terms(model, inputs, known)
     outputs = _sum((model.g, model.e_g, model.corrected_outputs), (wide, inputs), value)
     if model.passing is None:
         return outputs
@@ -348,38 +362,13 @@ def _output(model: DFSM, inputs: jax.Array, value: jax.Array | None = None) -> j
     return outputs + model.passing(inputs, harmonics, s)
 
 
-def functions_of_points(model: DFSM) -> tuple[PointFunction, PointFunction]:
-    """f̂ and ĝ at single points as plain functions, for whoever writes them down for others.
-
-    Both take the vectors of `DFSM.derivative` and `DFSM.output`, and ĝ in addition an azimuth and
-    the wind field; nothing in them is compiled or batched.
-    """
-    model = model.prepared()
-    order = model.signals.order
-
-    def derivative(*groups: jax.Array) -> jax.Array:
-        value = order.element(model.f.schedule, *groups)
-        return _derivative(model, order.join(*groups), value)
-
-    def output(
-        x: jax.Array, u: jax.Array, w: jax.Array, p: jax.Array, *turning: jax.Array
-    ) -> jax.Array:
-        if model.g is None:
-            return jnp.zeros(0)
-        groups = (x, u, w, p)
-        harmonics = model._harmonics(*(turning or (None, None)))
-        inputs = jnp.concatenate([order.join(*groups), harmonics])
-        return _output(model, inputs, order.element(model.g.schedule, *groups))
-
-    return derivative, output
-
-
-def _with_terms(model: DFSM, inputs: jax.Array) -> jax.Array:
+def _with_terms(model: DFSM, inputs: jax.Array, known: jax.Array | None) -> jax.Array:
     """What the linear fits take: [I, φ], and blade harmonics last, of one [I, harmonics]."""
     if model.terms is None:
         return inputs
     n = len(model.signals.inputs)
-    return jnp.concatenate([inputs[:n], model.terms(inputs[:n]), inputs[n:]])
+    values = model.terms(inputs[:n]) if known is None else known
+    return jnp.concatenate([inputs[:n], values, inputs[n:]])
 
 
 def _sum(
@@ -413,7 +402,7 @@ def _evaluate(
     schedule: int | None,
     harmonics: jax.Array | None = None,
 ) -> jax.Array:
-    """Evaluate `_derivative` or `_output` at groups of inputs ``(..., n)``, and ĝ's harmonics.
+    """`derivative_row` or `output_row` at groups of inputs ``(..., n)``, and ĝ's harmonics.
 
     All of it in one compiled function: each operation outside would be compiled by itself.
     """

@@ -322,8 +322,8 @@ def _segment(
         base, k, total = carry
         (a, b, last, h), inputs = at[:4], at[4:]
         state = base + a * h * k
-        s, vectors, duration = signals(state[:-1], *inputs)
-        k = jnp.concatenate([functions.plant.derivative(*vectors), functions.integrand(s)])
+        s, duration = signals(state[:-1], *inputs)
+        k = jnp.concatenate([s.derivative, functions.integrand(s)])
         k = k * duration
         total = total + b * h * k
         base = jnp.where(last, total, base)

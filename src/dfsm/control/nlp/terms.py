@@ -7,7 +7,7 @@ and problems that differ only in numbers (bounds, disturbances, mesh) share the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,7 @@ from dfsm.control.names import End, Signals
 from dfsm.control.nlp.structure import curved, dependent, varies
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.host import from_host
-from dfsm.core.types import Array
+from dfsm.core.types import Array, IntArray
 from dfsm.errors import DfsmError
 
 # Rows are evaluated in blocks of few lengths: all meshes of a problem share a compilation, and what
@@ -77,12 +77,12 @@ class Term:
         """Outputs ``(row, output)`` at local vectors ``(row, local)``."""
         return self._padded(self._values, common, z, data)
 
-    def jacobian(self, z: Array, data: Any, common: Any, of: Sequence[int]) -> Array:
+    def jacobian(self, z: Array, data: Any, common: Any, of: IntArray | Elements) -> Array:
         """Jacobians with some elements of the local vector, at least one: ``(row, output, of)``."""
         return self._padded(partial(self._jacobian, _elements(of)), common, z, data)
 
     def hessian(
-        self, z: Array, data: Any, common: Any, weights: Array, of: Sequence[int]
+        self, z: Array, data: Any, common: Any, weights: Array, of: IntArray | Elements
     ) -> Array:
         """Hessians of the outputs times weights ``(row, output)``, ``(row, of, of)``.
 
@@ -131,7 +131,7 @@ class Term:
         return (blocks[0] if len(blocks) == 1 else np.concatenate(blocks))[:count]
 
 
-def _elements(of: Sequence[int]) -> Elements:
+def _elements(of: IntArray | Elements) -> Elements:
     return tuple(int(i) for i in of)
 
 
@@ -204,14 +204,14 @@ class Functions:
         table = common["table"][data["scenario"]]
         return jax.vmap(lambda v: jnp.interp(t, common["table_time"], v), 1)(table)
 
-    def signals(self, z: jax.Array, data: Any, common: Any) -> tuple[Signals, tuple, jax.Array]:
-        """Named signals of a node, its plain vectors, and the length of the horizon in s."""
+    def signals(self, z: jax.Array, data: Any, common: Any) -> tuple[Signals, jax.Array]:
+        """Named signals of a node, and the length of the horizon in s."""
         x, u, q = jnp.split(z, [self.nx, self.nx + self.nu])
         p, stop = self.unpack(q, common)
         duration = stop - common["start"]
         t = common["start"] + data["tau"] * duration
         vectors = (x, u, self.disturbances(t, data, common), p)
-        return Signals(self.plant, t, vectors), vectors, duration
+        return Signals(self.plant, t, vectors), duration
 
     def integrand(self, s: Signals) -> jax.Array:
         """L at a node, shape ``(1,)``."""
@@ -224,12 +224,12 @@ class Functions:
         return jnp.concatenate([jnp.zeros(0), *parts])
 
     def _node_cost(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
-        s, _, duration = self.signals(z, data, common)
+        s, duration = self.signals(z, data, common)
         return self.integrand(s) * duration
 
     def _node_constraints(self, z: jax.Array, data: Any, common: Any) -> jax.Array:
-        s, vectors, duration = self.signals(z, data, common)
-        return jnp.concatenate([self.plant.derivative(*vectors) * duration, self.path(s)])
+        s, duration = self.signals(z, data, common)
+        return jnp.concatenate([s.derivative * duration, self.path(s)])
 
     def end_pair(self, z: jax.Array, common: Any) -> tuple[End, End]:
         """Named signals of both ends."""

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.types import Array
