@@ -28,14 +28,12 @@ from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
+from dfsm.models.past import repeated_until, with_past
 from dfsm.models.terms import Terms
 from dfsm.models.terms.form import Schedule
 from dfsm.models.wakes import settled_wakes
 from dfsm.models.wider import with_more_states, with_range
-from dfsm.numerics.time_mesh import mean_over, weights_over_time
 
-# Before the record begins, the inputs are taken to have been what they were on average over this.
-_REST = 20.0  # s
 # Step counts are padded to a multiple of this, so that runs of similar length share a compilation.
 _PAD = 1000
 
@@ -168,7 +166,8 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     model
         The surrogate.
     run
-        Holds its controls and disturbances, from as long before the time of interest as possible.
+        Holds its controls and disturbances, from as long before the time of interest as possible;
+        before that they are taken to have been as `with_past` says.
 
     Returns
     -------
@@ -182,16 +181,16 @@ def latent_path(model: DFSM, run: Trajectory) -> Array:
     """
     if not model.signals.pairs:
         return np.zeros((len(run), 0))
-    inputs = run.select(model.signals.driving).require_finite()
-    padded = -(-(len(run) - 1) // _PAD) * _PAD
+    held = _held(model)
+    inputs, count, mean = with_past(run.select(model.signals.driving).require_finite(), held)
+    padded = -(-(len(inputs) - 1) // _PAD) * _PAD
     h = np.zeros(padded)
-    h[: len(run) - 1] = np.diff(run.time)
-    v = np.concatenate([inputs.values, np.repeat(inputs.values[-1:], padded + 1 - len(run), 0)])
-    ends, held = None, _held(model)
-    if held.any():
-        ends = from_host(np.where(held, v[:-1], v[1:]))
-    path = as_states(evolve(poles(model), h, v, rest(run.time, inputs.values), ends))
-    return np.asarray(path)[: len(run)]
+    h[: len(inputs) - 1] = np.diff(inputs.time)
+    more = padded + 1 - len(inputs)
+    v = np.concatenate([inputs.values, np.repeat(inputs.values[-1:], more, 0)])
+    ends = from_host(np.where(held, v[:-1], v[1:])) if held.any() else None
+    path = as_states(evolve(poles(model), h, v, mean, ends))
+    return np.asarray(path)[count : count + len(run)]
 
 
 def _held(model: DFSM) -> NDArray[np.bool_]:
@@ -216,23 +215,16 @@ def latents_at(model: DFSM, run: Trajectory, time: Array) -> Array:
 def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
     """Latent pairs at a time in s, shape ``(2 pair,)``, from the inputs recorded up to it.
 
-    Where the record begins there, they are at rest. The arguments are those of `latent_path`.
+    Near the beginning of the record what comes after it counts, too, see `with_past`. The arguments
+    are those of `latent_path`.
     """
     if not model.signals.pairs:
         return np.empty(0)
-    now = max(2, int(np.searchsorted(run.time, start, side="right")))
-    past = run.select(model.signals.driving)
-    past = replace(past, time=past.time[:now], values=past.values[:now])
-    path = latent_path(model, past)
-    return path[-1] if now > 2 else path[0]
-
-
-def rest(time: Array, inputs: Array) -> Array:
-    """Inputs before a record begins, ``(input,)`` from ``(time, input)``."""
-    before = time <= time[0] + _REST
-    if before.sum() < 2:
-        return inputs[0]
-    return mean_over(inputs[before], weights_over_time([time[before]]))
+    now = max(1, int(np.searchsorted(run.time, start, side="right")))
+    end = max(now, repeated_until(run.time) + 1)
+    inputs = run.select(model.signals.driving)
+    inputs = replace(inputs, time=inputs.time[:end], values=inputs.values[:end])
+    return latent_path(model, inputs)[now - 1]
 
 
 # -- adding them to a model ---------------------------------------------------------------------

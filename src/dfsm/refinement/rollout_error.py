@@ -30,7 +30,8 @@ from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.models.latents import Poles, as_states, evolve, poles, rest
+from dfsm.models.latents import Poles, as_states, evolve, poles
+from dfsm.models.past import with_past
 from dfsm.models.recorded import recorded_states
 from dfsm.models.wakes import wakes_along
 from dfsm.numerics.filters import moving_average
@@ -135,17 +136,17 @@ def record_of(
     recorded = recorded_states(model, run, start)
     window = run.window(start, stop)
     count = int(window.duration / step * (1 + 1e-9))
-    before = int((window.time[0] - run.time[0]) / step * (1 + 1e-9))
+    held = np.array([kind == "hold" for kind in kinds], dtype=bool)
+    driven, _, mean = with_past(run.select(s.exogenous).require_finite(), held)
+    before = int((window.time[0] - driven.time[0]) / step * (1 + 1e-9))
     mesh = window.time[0] + step / 2 * np.arange(-2 * before, 2 * count + 1)
-    run.select(s.exogenous).require_finite()
     dense = run.time_step is not None and run.time_step < step / 2
     inputs = [
-        np.interp(mesh, run.time, moving_average(run.time, run[n], step) if dense else run[n])
-        for n in s.exogenous
+        np.interp(mesh, driven.time, moving_average(driven.time, v, step) if dense else v)
+        for v in driven.values.T
     ]
-    held = np.array([kind == "hold" for kind in kinds], dtype=bool)
     for k in np.flatnonzero(held):
-        inputs[k] = _held_along(mesh, run.time, run[s.exogenous[k]])
+        inputs[k] = _held_along(mesh, driven.time, driven.values[:, k])
     at = mesh[2 * before :: 2]
     slopes = [
         np.interp(at, recorded.found.trajectory.time, d) for d in recorded.found.derivatives.T
@@ -156,7 +157,7 @@ def record_of(
         recorded.at(at),
         np.stack(slopes, axis=1),
         np.stack(inputs, axis=1),
-        rest(run.time, run.select(s.driving).values),
+        mean[: len(s.driving)],
         held if held.any() else None,
     )
 
