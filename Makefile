@@ -16,11 +16,11 @@ demo: $(VENV)/.installed
 	$(BIN)/python examples/iea15/demo.py --output out
 	$(BIN)/python examples/iea15/optimal_control.py --models out --output out
 
-# Everything but the studies. Without XLA's fusion emitters and at its lowest level loops are compiled
-# in half the time and take up to twice as long: tests compile more than they compute.
-test: export XLA_FLAGS += --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
+# Everything but the studies. Without XLA's fusion emitters, where they can be left out, and at its
+# lowest level loops are compiled in half the time and take up to twice as long: tests compile more
+# than they compute.
 test: $(VENV)/.installed-dev
-	$(PYTEST) -m "not slow and not notebook"
+	XLA_FLAGS="$$XLA_FLAGS $$($(BIN)/python .ci/xla_flags.py)" $(PYTEST) -m "not slow and not notebook"
 
 # What the documentation states, computed again. Only files that hold studies are collected.
 studies: $(VENV)/.installed-dev

@@ -270,8 +270,10 @@ def test_constant_coefficients(runs):
     L = np.asarray(fit(runs, choices).model.f.coefficients)
     assert (L[:, 0, 0] == L[0, 0, 0]).all()
     assert np.ptp(L[:, 0, 1]) > 0
-    refined = fit(runs, choices, WITHOUT).model
+    # With latent states refinement gains whichever runs are held out.
+    refined = fit(runs, choices, replace(WITHOUT, latents=2)).model
     L = np.asarray(refined.f.coefficients)
+    assert len(refined.signals.latents) == 2
     assert np.ptp(L[:, 0, 0]) == 0
     assert np.ptp(L[:, 0, 1]) > 0
     with pytest.raises(DfsmError, match=r"linear\.constant names 'torque', which is not an input"):

@@ -407,4 +407,6 @@ def test_the_residual_that_remembers_longest_counts_for_all_targets():
     slow = starved(20)
     both = [(X, np.hstack([y, rng.standard_normal(y.shape)])) for X, y in slow]
     alone = fit_linear(slow, NAMES, choice, windows).equations[2].independent
-    assert fit_linear(both, NAMES, choice, windows).equations[2].independent == alone
+    # Sums of other shapes round differently in some libraries.
+    found = fit_linear(both, NAMES, choice, windows).equations[2].independent
+    assert found == pytest.approx(alone, rel=1e-9)

@@ -53,8 +53,10 @@ def test_it_predicts_what_it_did(models, predictions, name):
 def test_it_is_simulated_as_it_was(models, predictions):
     channels = tuple(Channel(*both) for both in UNITS.items())
     record = Trajectory(predictions["rollout/time"], predictions["rollout/record"], channels)
+    # From the state it began in then: what comes before a record is taken otherwise today.
+    initial = predictions["rollout/values"][0, :4]
     with hushed():
-        rollout = simulate(models["multi-fidelity"], record, start=1.0)
+        rollout = simulate(models["multi-fidelity"], record, start=1.0, initial=initial)
     assert rollout.status is Status.COMPLETED
     assert rollout.trajectory.names == ("q", "q_dot", "latent1", "latent2", "y", "z")
     # Rounding grows along a rollout.

@@ -64,6 +64,7 @@ def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) 
     final_cost = float(program.blocks[1].c @ program.outputs(z)[1].ravel())
     objective = program.cost(z)
     trajectories = _trajectories(problem, shot.grid.tau, start)
+    outside, leaving = _leaving(problem, trajectories)
     replays = ()
     if simulate and (ending.solved or ending in _UNTRUE):
         count = range(len(problem.scenarios))
@@ -86,8 +87,8 @@ def solution_of(problem: OptimalControlProblem, record: Record, simulate: bool) 
         seconds={"compile": record.compile, "solve": record.solve},
         linear_quadratic=program.linear_quadratic,
         violation=worst_violation(program, z),
-        outside=_outside(problem, trajectories),
-        departures=_departures(problem, trajectories),
+        outside=outside,
+        departures=leaving,
         replays=replays,
         bounds=_bounds(shot, trajectories[0].time),
         solver_state=outcome.multipliers,
@@ -212,28 +213,25 @@ def _trajectories(
     return tuple(runs)
 
 
-def _outside(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> float | None:
-    """Share of the horizon with any input outside the training range."""
-    region = problem.plant.region
-    if region is None:
-        return None
-    shares = [_weights(run) @ np.asarray(region.outside(inputs_of(problem, run))) for run in runs]
-    return float(np.mean(shares))
+def _leaving(
+    problem: OptimalControlProblem, runs: Sequence[Trajectory]
+) -> tuple[float | None, tuple[str, ...]]:
+    """Share of the horizon with any input outside the training range, and where it is so.
 
-
-def _departures(problem: OptimalControlProblem, runs: Sequence[Trajectory]) -> tuple[str, ...]:
-    """Per scenario that leaves the training range, where it does."""
-    plant, sentences = problem.plant, []
+    In words per scenario that leaves it; None and nothing without a training range.
+    """
+    plant, shares, sentences = problem.plant, [], []
     if plant.region is None:
-        return ()
+        return None, ()
     channels = [c for group in GROUPS for c in plant.channels[group]]
     for run in runs:
-        inputs = inputs_of(problem, run)
+        inputs, weights = inputs_of(problem, run), _weights(run)
         outside = np.asarray(plant.region.outside(inputs))
-        found = departures(plant.region, channels, run.time, inputs, outside, _weights(run))
+        shares.append(weights @ outside)
+        found = departures(plant.region, channels, run.time, inputs, outside, weights)
         if found:
             sentences.append(f"{run.name}: {told(found)}" if runs[1:] else told(found))
-    return tuple(sentences)
+    return float(np.mean(shares)), tuple(sentences)
 
 
 def _weights(run: Trajectory) -> Array:

@@ -53,6 +53,16 @@ def _composed(make: Callable[..., int]) -> Rule:
     return rule
 
 
+def _polynomial(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
+    """Of its first operand, with coefficients from the lowest degree on, by Horner's rule."""
+    shape = _shape(equation)
+    x, *coefficients = (_real(to, v, "polynomial", shape) for v in operands)
+    total = coefficients.pop()
+    for coefficient in reversed(coefficients):
+        total = to.steps.apply("add", to.steps.apply("mul", total, x), coefficient)
+    return [Traced(shape, total)]
+
+
 def _each_part(name: str) -> Rule:
     """Sums, differences and signs, of real and imaginary parts alike."""
 
@@ -416,6 +426,7 @@ RULES: dict[str, Rule] = {
         )
     ),
     "integer_pow": _power,
+    "polynomial": _polynomial,
     "convert_element_type": _converted,
     "select_n": _select,
     "clamp": _clamp,

@@ -100,7 +100,10 @@ class Translator:
         from dfsm.exports.rules import RULES
 
         name = equation.primitive.name
-        inner = _inner(equation.params)
+        if name == "unstack":
+            axis, (value,) = equation.params["axis"], operands
+            return [self.row(value, k, axis) for k in range(value.shape[axis])]
+        inner = _inner(equation)
         if name in ("scan", "cond"):
             return (
                 self._scan(equation.params, operands)
@@ -117,7 +120,7 @@ class Translator:
 
     def _scan(self, params: Any, operands: list[Value]) -> list[Value]:
         """A loop of known length, written out."""
-        length, consts, carries = params["length"], params["num_consts"], params["num_carry"]
+        length, (consts, carries) = params["length"], _scanned(params)
         if length > _MOST_TURNS:
             raise UntranslatableError(f"scan of {length} turns")
         fixed, carry = operands[:consts], operands[consts : consts + carries]
@@ -199,12 +202,12 @@ class Translator:
         zero = self.steps.constant(np.zeros(1))
         return Traced(at.shape, real, moved([zero if p.imag is None else p.imag for p in parts]))
 
-    def row(self, value: Value, k: int) -> Value:
-        """One element along the first axis."""
+    def row(self, value: Value, k: int, axis: int = 0) -> Value:
+        """One element along an axis."""
         if isinstance(value, np.ndarray):
-            return value[k]
+            return np.take(value, k, axis)
         numbers = np.arange(np.prod(value.shape), dtype=np.float64).reshape(value.shape)
-        return self.taken([value], numbers[k])
+        return self.taken([value], np.take(numbers, k, axis))
 
     def stacked(self, values: list[Value]) -> Value:
         """Values along a new first axis."""
@@ -234,8 +237,21 @@ class Translator:
         return Traced(shape, real, of([zero if t.imag is None else t.imag for t in traced]))
 
 
-def _inner(params: Any) -> Any:
-    """The jaxpr that an equation calls."""
+def _scanned(params: Any) -> tuple[int, int]:
+    """Numbers of operands of a loop that stay, and that it carries; groups from JAX 0.12 on."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts.vals), len(carry.vals)
+
+
+def _inner(equation: Any) -> Any:
+    """The jaxpr that an equation calls, or that a primitive of a higher level stands for."""
+    params = equation.params
+    expand = getattr(params.get("_prim"), "expand", None)
+    if expand is not None:
+        shapes = (jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars)
+        return jax.make_jaxpr(expand)(*shapes)
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         inner = params.get(key)
         if inner is not None:

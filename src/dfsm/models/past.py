@@ -51,7 +51,5 @@ def with_past(run: Trajectory, held: NDArray[np.bool_]) -> tuple[Trajectory, int
     before = np.where(held, v[last - 1 :: -1], v[last:0:-1])
     before = np.where((v[:_STILL] == v[0]).all(axis=0), v[0], before)
     mean = mean_over(before, weights_over_time([time])) if last > 1 else before[0]
-    longer = replace(
-        run, time=np.concatenate([time, run.time]), values=np.concatenate([before, v])
-    )
+    longer = replace(run, time=np.concatenate([time, run.time]), values=np.concatenate([before, v]))
     return longer, last, mean

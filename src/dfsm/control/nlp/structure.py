@@ -26,8 +26,8 @@ _ELEMENTWISE = frozenset({
     "cbrt", "ceil", "clamp", "convert_element_type", "copy", "cos", "cosh", "div", "eq", "erf",
     "erf_inv", "erfc", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite",
     "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter",
-    "not", "or", "pow", "reduce_precision", "rem", "round", "rsqrt", "select_n", "sign", "sin",
-    "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor"
+    "not", "or", "polynomial", "pow", "reduce_precision", "rem", "round", "rsqrt", "select_n",
+    "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor"
 })
 # fmt: on
 
@@ -153,6 +153,9 @@ def _through(equation: Any, enters: Masks) -> Masks:
         return [_MOVES[name](enters[0], options)]
     if name in _JOINS:
         return [_JOINS[name](enters, options)]
+    if name == "unstack":
+        axis = options["axis"]
+        return [np.take(enters[0], k, axis) for k in range(enters[0].shape[axis])]
     if name == "split":
         ends = np.cumsum(options["sizes"])[:-1]
         return np.split(enters[0], ends, options["axis"])
