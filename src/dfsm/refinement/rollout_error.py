@@ -54,14 +54,15 @@ class Record:
     step
         In s.
     before
-        Steps between the start of the record and the first state; latent states need them.
+        Steps before the first state, on what was recorded and what `with_past` puts in front of
+        it; latent states need them.
     states, slopes
         Observed states and their derivatives, shape ``(step + 1, state)``.
     inputs
         Exogenous inputs at ends and middles of all steps, those before the first state included,
         ``(2 (before + step) + 1, exogenous)``.
     rest
-        Controls and disturbances before the record begins.
+        Controls and disturbances before those steps.
     held
         Which exogenous inputs are the same throughout each step, as in its middle,
         ``(exogenous,)``; None where none is.
@@ -84,7 +85,7 @@ class Record:
         return np.concatenate([begin, v[-1:, :n]]), end
 
     def follow(self, filters: Poles) -> Array:
-        """Latent pairs from the start of the record on, complex, ``(before + step + 1, pair)``."""
+        """Latent pairs at all ends of steps, complex, ``(before + step + 1, pair)``."""
         h = np.full(len(self.inputs) // 2, self.step)
         v, ends = self.driving()
         ends = None if ends is None else from_host(ends)
@@ -188,12 +189,12 @@ class _Windows(NamedTuple):
     first
         Steps from the start of the record to that of each window.
     record, rest
-        Controls and disturbances of the whole record at the ends of steps, and before it.
+        Controls and disturbances of the record at the ends of all steps, and before these.
     held, record_ends
         As `Record.held`, and what `Record.driving` says of the record.
     before, along
-        Steps of the record before its first state, and from there on the states ``(time, state)``
-        and the exogenous inputs; None for a model without induced velocities.
+        Steps of the record before its first state, and from there on the states
+        ``(time, state)`` and the exogenous inputs; None for a model without induced velocities.
     """
 
     step: float
