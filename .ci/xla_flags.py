@@ -11,10 +11,7 @@ import sys
 
 FLAGS = ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
 # Makes XLA read its flags.
-READ = (
-    "from jaxlib import xla_client; "
-    "xla_client.CompileOptions().executable_build_options.debug_options"
-)
+READ = "import dfsm.core.jax_setup"
 
 
 def known(flag: str) -> bool:

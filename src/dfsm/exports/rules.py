@@ -379,6 +379,11 @@ def _product(to: Translator, equation: Any, operands: list[Value]) -> list[Value
     return [Traced(shape, to.steps.join(parts))]
 
 
+def _unstacked(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
+    axis, (value,) = equation.params["axis"], operands
+    return [to.row(value, k, axis) for k in range(value.shape[axis])]
+
+
 RULES: dict[str, Rule] = {
     **{
         name: _applied(name)
@@ -427,6 +432,7 @@ RULES: dict[str, Rule] = {
     ),
     "integer_pow": _power,
     "polynomial": _polynomial,
+    "unstack": _unstacked,
     "convert_element_type": _converted,
     "select_n": _select,
     "clamp": _clamp,

@@ -100,9 +100,6 @@ class Translator:
         from dfsm.exports.rules import RULES
 
         name = equation.primitive.name
-        if name == "unstack":
-            axis, (value,) = equation.params["axis"], operands
-            return [self.row(value, k, axis) for k in range(value.shape[axis])]
         inner = _inner(equation)
         if name in ("scan", "cond"):
             return (

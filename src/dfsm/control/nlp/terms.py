@@ -71,7 +71,9 @@ class Term:
         self._function, self._weighted = function, weighted
         self._values = jax.jit(jax.vmap(function, (0, 0, None)))
         self._jacobian, self._hessian = rows(jacobian, (0, 0, None)), rows(hessian, (0, 0, None, 0))
+        # Known of the code, whatever the numbers; asked for on every mesh.
         self._curved: NDArray[np.bool_] | None = None
+        self._quadratic: bool | None = None
 
     def values(self, z: Array, data: Any, common: Any) -> Array:
         """Outputs ``(row, output)`` at local vectors ``(row, local)``."""
@@ -97,9 +99,9 @@ class Term:
         overcautious.
         """
         if self._curved is None:
-            one = (z[0], jax.tree.map(lambda a: a[0], data), common)
-            outputs = jax.eval_shape(self._function, *one).shape
-            self._curved = curved(self._weighted, *one, from_host(np.ones(outputs)))
+            row = _row(z, data, common)
+            outputs = jax.eval_shape(self._function, *row).shape
+            self._curved = curved(self._weighted, *row, from_host(np.ones(outputs)))
         return self._curved
 
     def is_quadratic(self, z: Array, data: Any, common: Any) -> bool:
@@ -109,10 +111,11 @@ class Term:
         """
         if self.parts is None:
             return False
-        example = (z[0], jax.tree.map(lambda a: a[0], data), common)
-        objective, constraints = self.parts
-        second, first = jax.jacfwd(jax.jacrev(objective)), jax.jacfwd(constraints)
-        return not (varies(second, *example) or varies(first, *example))
+        if self._quadratic is None:
+            row, (objective, constraints) = _row(z, data, common), self.parts
+            second, first = jax.jacfwd(jax.jacrev(objective)), jax.jacfwd(constraints)
+            self._quadratic = not (varies(second, *row) or varies(first, *row))
+        return self._quadratic
 
     @staticmethod
     def _padded(function: Callable[..., jax.Array], common: Any, z: Array, *rest: Any) -> Array:
@@ -129,6 +132,11 @@ class Term:
             part = jax.tree.map(lambda a, k=first: a[k : k + size], padded)
             blocks.append(np.asarray(function(part[0], part[1], common, *part[2:])))
         return (blocks[0] if len(blocks) == 1 else np.concatenate(blocks))[:count]
+
+
+def _row(z: Array, data: Any, common: Any) -> tuple[Array, Any, Any]:
+    """Arguments of a term's function at the first of many rows."""
+    return z[0], jax.tree.map(lambda a: a[0], data), common
 
 
 def _elements(of: IntArray | Elements) -> Elements:
