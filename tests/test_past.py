@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.models.latents import Poles, evolve
+from dfsm.errors import DfsmError
+from dfsm.models.latents import Poles, evolve, latent_state
+from dfsm.models.model_folder import load_all
 from dfsm.models.past import with_past
 from systems import wander
 
@@ -25,6 +28,7 @@ def record(stop: float = 400.0) -> Trajectory:
     return Trajectory(time, values, tuple(Channel(n, "-") for n in NAMES), name="record")
 
 
+SAVED = Path(__file__).parent / "data" / "saved_by_0.1" / "model"
 HELD = np.array([False, True, False])
 
 
@@ -81,3 +85,18 @@ def test_slow_states_start_where_they_are_on_average():
     assert np.abs(starts).max() < np.abs(truth).max()
     # Under the first value, held for ever, they would start far out.
     assert np.std(at_rest) > 3 * spread
+
+
+def test_what_is_missing_later_in_the_record_spoils_no_start():
+    model = load_all(SAVED)["multi-fidelity"]
+    rng, time = np.random.default_rng(1), np.arange(0, 200.0, STEP)
+    values = np.stack([wander(rng, 0.3, 200.0, 2.0)(time) for _ in range(2)], axis=1)
+    run = Trajectory(time, values, tuple(Channel(n, "-") for n in model.signals.driving))
+    broken = values.copy()
+    broken[100, 0] = np.nan  # at 50 s
+    found = latent_state(model, replace(run, values=broken), 0.0)
+    np.testing.assert_array_equal(
+        found, latent_state(model, replace(run, time=time[:100], values=values[:100]), 0.0)
+    )
+    with pytest.raises(DfsmError, match="1 NaN or infinite samples, the first at 50 s"):
+        latent_state(model, replace(run, values=broken), 60.0)

@@ -223,6 +223,9 @@ def latent_state(model: DFSM, run: Trajectory, start: float) -> Array:
     now = max(1, int(np.searchsorted(run.time, start, side="right")))
     end = max(now, repeated_until(run.time) + 1)
     inputs = run.select(model.signals.driving)
+    # A fault of the record that comes later spoils nothing.
+    faults = np.flatnonzero(~np.isfinite(inputs.values[now:end]).all(axis=1))
+    end = max(2, now + faults[0]) if faults.size else end
     inputs = replace(inputs, time=inputs.time[:end], values=inputs.values[:end])
     return latent_path(model, inputs)[now - 1]
 
