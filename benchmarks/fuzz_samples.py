@@ -263,7 +263,7 @@ def _texts(folder: Path) -> list[Sample]:
     intervals = Intervals(("q", "y"), ("m", "kN"), "w", np.array([6.0, 12.0]), half, 0.9, (), ())
     intervals.save(folder / "intervals.json")
     result = {
-        "format": 1,
+        "format": 2,
         "outcome": {"message": "", "nrmse": {"q": 0.2}, "diverged": 0, "fit_seconds": 1.0},
         "model": "0" * 64,
         "fingerprint": "1" * 64,

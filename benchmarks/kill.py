@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -170,11 +171,12 @@ def killed_everywhere(
             if in_steps:
                 recover(folder / target)
             found = content(folder / target)
-            if found not in (before, after) and not (found and is_whole(found, after)):
+            if found not in (before, after) and not (found and is_new(found, before, after)):
                 wrong.append(f"event {at}: the target is neither old nor new")
             if full and (done.code != 2 or done.err.count("\n") > 1):
                 wrong.append(f"event {at}: exit {done.code}, {done.err[-300:]!r}")
-            if not full:
+            # It ended undisturbed in a folder without anything left behind.
+            if not full and _everything(folder) != _everything(source):
                 again = attempt(folder, _NEVER, False)
                 left = sorted(p.name for p in folder.rglob(".*dfsm-*"))
                 if again.code not in (0, 1) or left:
@@ -182,20 +184,31 @@ def killed_everywhere(
             shutil.rmtree(folder)
 
 
+def _everything(folder: Path) -> dict[str, bytes]:
+    paths = sorted(folder.rglob("*"))
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"" for p in paths}
+
+
 def content(path: Path) -> Mapping[str, bytes] | None:
-    """What a file or folder holds but for what begins with a dot; None where there is nothing."""
+    """What a file or folder holds but for hidden files and journals; None where nothing is."""
     if path.is_file():
         return {"": path.read_bytes()}
     if not path.exists():
         return None
     files = (p for p in sorted(path.rglob("*")) if p.is_file())
     named = {str(p.relative_to(path)): p.read_bytes() for p in files}
-    return {n: b for n, b in named.items() if not any(x.startswith(".") for x in Path(n).parts)}
+    hidden = {n for n in named if any(x.startswith(".") for x in Path(n).parts)}
+    return {n: b for n, b in named.items() if n not in hidden and not n.endswith(".jsonl")}
 
 
-def is_whole(found: Mapping[str, bytes], expected: Mapping[str, bytes]) -> bool:
-    """Whether something is a complete result, though its wall times may be others."""
+def is_new(
+    found: Mapping[str, bytes], before: Mapping[str, bytes] | None, expected: Mapping[str, bytes]
+) -> bool:
+    """Whether something is the complete new result, though its wall times may be others."""
     if set(found) != set(expected):
+        return False
+    replaced = {n: b for n, b in (before or {}).items() if expected.get(n) != b}
+    if any(found[n] == b for n, b in replaced.items() if n in found):
         return False
     for name, raw in found.items():
         if name.endswith("manifest.json"):
@@ -231,18 +244,39 @@ def run() -> dict[str, Any]:
         "c": ("export-rosco", "solution", "--torque", "Torque", "-o", "c"),
         "w/calm.parquet": ("wind", "field.bts", "calm.csv", "--radius", "12", "-o", "w", "-q"),
         "all/raw": ("compare", "config.yaml", "-o", "all", "--jobs", "1", "-q"),
+        "card.html": ("report", "model", "-o", "card.html", "-q"),
+        "loop": (*_LOOP, "-o", "loop", "-q"),
+        "loop.html": (*_LOOP, "-o", "loop", "--report", "loop.html", "-q"),
+        "swept": ("sweep", "sweep.yaml", "-o", "swept", "-q"),
+        "tuned": ("tune", "tune.yaml", "-o", "tuned", "-q"),
+        "lines.mat": ("export", "state-space", "model", "-o", "lines.mat", "-q"),
+        "m.casadi": ("export", "casadi", "model", "-o", "m.casadi", "-q"),
+        "code": ("export", "c", "model", "-o", "code", "-q"),
+        "script": ("export", "python", "model", "-o", "script", "-q"),
+        "m.fmu": ("export", "fmu", "model", "-o", "m.fmu", "-q"),
     }
-    figures: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as base:
+    with tempfile.TemporaryDirectory() as base, ThreadPoolExecutor(os.cpu_count()) as pool:
         source = Path(base) / "source"
         _prepare(source)
-        for target, arguments in commands.items():
-            for full in (False, True):
-                events, wrong = killed_everywhere(command(*arguments), source, target, full=full)
-                name = f"{arguments[0]} {target}{' on a full disk' if full else ''}"
-                figures[name] = {"events": events, "wrong": wrong}
-                print(f"{name}: {events} events, {len(wrong)} wrong", file=sys.stderr, flush=True)
+        tried = {
+            f"{arguments[0]} {target}{' on a full disk' if full else ''}": pool.submit(
+                killed_everywhere, command(*arguments), source, target, full=full
+            )
+            for target, arguments in commands.items()
+            for full in (False, True)
+        }
+        figures: dict[str, Any] = {}
+        for name, ended in tried.items():
+            events, wrong = ended.result()
+            figures[name] = {"events": events, "wrong": wrong}
+            print(f"{name}: {events} events, {len(wrong)} wrong", file=sys.stderr, flush=True)
     return figures
+
+
+_LOOP = (
+    *("closed-loop", "model", "test.csv", "--controller", "control.py:pid"),
+    *("--start-up", "1", "--start", "2"),
+)
 
 
 _CONFIG = """\
@@ -261,6 +295,18 @@ bounds: {Torque: [-2, 2]}
 initial: recorded
 nodes: 11
 """
+_CONTROLLER = """\
+import dfsm
+
+pid = dfsm.PID(
+    kp=0.5, ki=0.2, setpoint=0.2, limits=(-2.0, 2.0), interval=0.05,
+    measurements=["q"], measurement_units=["m"], commands=["Torque"], command_units=["kNm"],
+)
+"""
+_LOOPS = "{model: model, controller: control.py:pid, runs: test.csv, start: 2, start_up: 1, "
+_TUNE = """\
+parameters: {kp: [0.1, 2.0]}, objective: [{measure: std, channel: q}], starts: 1, iterations: 2}
+"""
 
 
 def _prepare(source: Path) -> None:
@@ -276,13 +322,24 @@ def _prepare(source: Path) -> None:
     (source / "field.bts").write_bytes(wind_field(7))
     (source / "config.yaml").write_text(_CONFIG)
     (source / "problem.yaml").write_text(_PROBLEM)
+    (source / "control.py").write_text(_CONTROLLER)
+    (source / "sweep.yaml").write_text(_LOOPS + "gains: {kp: [0.2, 0.4]}}\n")
+    (source / "other.yaml").write_text(_LOOPS + "gains: {kp: [0.3, 0.6]}}\n")
+    (source / "tune.yaml").write_text(_LOOPS + _TUNE)
+    (source / "wide.yaml").write_text(_LOOPS + _TUNE.replace("2.0", "3.0"))
     for arguments in (
         ("fit", "config.yaml", "-o", "model", "-q"),
         ("optimize", "problem.yaml", "-o", "solution", "-q"),
+        # What stands where the commands write: other results, and a file of somebody else's.
+        (*_LOOP, "--stop", "5", "-o", "loop", "-q"),
+        ("sweep", "other.yaml", "-o", "swept", "-q"),
+        ("tune", "wide.yaml", "-o", "tuned", "-q"),
     ):
         done = command(*arguments)(source, _NEVER, False)
         if done.code:
             raise RuntimeError(done.err)
+    for folder in ("loop", "swept"):
+        (source / folder / "notes.txt").write_text("mine")
 
 
 def _oscillator(seed: int) -> Trajectory:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dfsm.core.files import write_file, write_folder
+from dfsm.core.files import check_together, write_file, write_folder, write_together
 from dfsm.errors import DfsmError
 
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
@@ -168,3 +168,78 @@ def test_a_foreign_folder_or_file_is_never_replaced(tmp_path):
     assert file.read_text() == "also precious"
     with pytest.raises(DfsmError, match="could not be written"):
         new_folder(tmp_path / "nowhere" / "model")
+
+
+# -- several files that belong together -----------------------------------------------------------
+
+
+def results(path: Path, content: str) -> None:
+    with write_together(path) as folder:
+        for name in ("figures.json", "page.html"):
+            (folder / name).write_text(content)
+
+
+def test_results_are_replaced_beside_what_else_is_there(tmp_path):
+    path = tmp_path / "deep" / "out"
+    results(path, "one")
+    (path / "notes.txt").write_text("mine")
+    (path / ".hidden").write_text("a system's")
+    (path / "runs" / "old").mkdir(parents=True)
+    (path / "runs" / "old" / "a.outb").write_text("run")
+    (path / "link").symlink_to("notes.txt")
+    results(path, "two")
+    assert {p.read_text() for p in path.glob("[fp]*.*")} == {"two"}
+    assert (path / "notes.txt").read_text() == (path / "link").read_text() == "mine"
+    assert (path / "link").is_symlink()
+    assert (path / "runs" / "old" / "a.outb").read_text() == "run"
+    assert names(path) == {"figures.json", "page.html", "notes.txt", ".hidden", "runs", "link"}
+    assert names(path.parent) == {"out"}
+
+
+def half_of_results(path: Path, failure: BaseException) -> None:
+    with write_together(path) as folder:
+        (folder / "figures.json").write_text("half")
+        raise failure
+
+
+@pytest.mark.parametrize("failure", [RuntimeError("x"), KeyboardInterrupt(), NO_SPACE])
+def test_a_failure_leaves_old_results(tmp_path, failure):
+    path = tmp_path / "out"
+    results(path, "one")
+    with pytest.raises((DfsmError, type(failure))):
+        half_of_results(path, failure)
+    assert {p.read_text() for p in path.iterdir()} == {"one"}
+    assert names(tmp_path) == {"out"}
+
+
+@pytest.mark.parametrize("why", ["the working folder", "no hard links"])
+def test_results_where_a_folder_cannot_be_replaced(tmp_path, monkeypatch, why):
+    path = tmp_path / "out"
+    results(path, "one")
+    (path / "notes.txt").write_text("mine")
+    if why == "no hard links":
+        monkeypatch.setattr("dfsm.core.files.os.link", lambda *_, **__: fail(errno.EPERM))
+    else:
+        monkeypatch.chdir(path)
+        path = Path()
+    stands = (tmp_path / "out").stat().st_ino
+    results(path, "two")
+    assert (tmp_path / "out").stat().st_ino == stands
+    assert names(tmp_path / "out") == {"figures.json", "page.html", "notes.txt"}
+    assert (tmp_path / "out" / "page.html").read_text() == "two"
+    assert names(tmp_path) == {"out"}
+
+
+def fail(number: int) -> None:
+    raise OSError(number, "refused")
+
+
+def test_results_that_cannot_be_written_are_refused_early(tmp_path):
+    (tmp_path / "a").write_text("mine")
+    with pytest.raises(DfsmError, match=r"a is a file, a folder was expected"):
+        check_together(tmp_path / "a")
+    (tmp_path / "out" / "sweep.json").mkdir(parents=True)
+    with pytest.raises(DfsmError, match=r"sweep.json is a folder, a file name was expected"):
+        check_together(tmp_path / "out", ["sweep.json"])
+    check_together(tmp_path / "not" / "yet" / "there", ["sweep.json"])
+    assert names(tmp_path) == {"a", "out"}

@@ -198,8 +198,8 @@ def test_foreign_files_are_refused(intervals, tmp_path, change, match):
 def test_missing_and_newer_files_are_refused(intervals, tmp_path):
     with pytest.raises(DfsmError, match="no such file"):
         load_intervals(tmp_path / "i.json")
-    (tmp_path / "i.json").write_text('{"format": 2}')
-    with pytest.raises(DfsmError, match=r"has format 2, this dfsm .* reads up to 1"):
+    (tmp_path / "i.json").write_text('{"format": 3}')
+    with pytest.raises(DfsmError, match=r"has format 3, this dfsm .* reads up to 2"):
         load_intervals(tmp_path / "i.json")
     with pytest.raises(DfsmError, match="could not be written"):
         intervals.save(tmp_path / "missing" / "i.json")

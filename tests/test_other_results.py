@@ -389,3 +389,10 @@ def test_uniform_winds_that_are_none(tmp_path, text, said):
     with pytest.raises(DfsmError, match="reference_length is -1, expected a positive number in m"):
         UniformSettings(hub_height=HUB, reference_length=-1)
     assert not is_uniform(Path(__file__))
+
+
+def test_a_uniform_wind_cut_in_its_only_row(tmp_path):
+    path = tmp_path / "a.wnd"
+    path.write_text("! Time Speed Dir Vert HShr VShr VLin Gust\n0.0 8.0 0.0 0.0 0.0 0.2 0.00 -")
+    with pytest.raises(DfsmError, match="its only row is incomplete"):
+        read_uniform(path, UniformSettings(hub_height=HUB))

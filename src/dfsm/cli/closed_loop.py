@@ -15,7 +15,10 @@ from dfsm.errors import DfsmError, hushed, near_matches
 
 if TYPE_CHECKING:
     from dfsm.controllers.controller import Controller
+    from dfsm.data.trajectory import Trajectory
+    from dfsm.validation.closed_loop import ClosedLoopValidation
 
+_FIGURES = "closed_loop.json"
 _HOLDS = "--controller names a DISCON.IN, or a Python file and what it holds as in control.py:mine"
 
 
@@ -56,9 +59,9 @@ def closed_loop(
 ) -> None:
     """Close the loop between a model and a controller, and compare with what was recorded."""
     from dfsm.cli.tables import print_article
-    from dfsm.core.files import check_file, write_json
+    from dfsm.core.fallback import write_or_keep
+    from dfsm.core.files import check_file, check_together
     from dfsm.data.readers import read_all
-    from dfsm.data.readers.tables import write_table
     from dfsm.models.model_folder import load
     from dfsm.report.article_page import write_article
     from dfsm.report.closed_loop_article import closed_loop_article
@@ -69,12 +72,12 @@ def closed_loop(
     stand_ins = pairs(measure or [])
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
-    output.mkdir(parents=True, exist_ok=True)
-    figures = output / "closed_loop.json"
     with working(quiet), hushed():  # the outcome is printed below
         runs = read_all(files)
-        targets = {run.name: output / f"{run.name}.parquet" for run in runs}
-        for target in (*targets.values(), figures, *([report] if report else [])):
+        targets = [_file(run) for run in runs]
+        check_together(output, [*targets, _FIGURES])
+        kept = [output / target for target in targets if (output / target).exists()]
+        for target in (*kept, *([report] if report else [])):
             check_file(target, [run.source for run in runs])
         sampled = runs[0].time_step
         law = controller_of(controller, library, interval or sampled)
@@ -87,12 +90,10 @@ def closed_loop(
             measurements=stand_ins,
             settings=settings,
         )
-    for compared in validation.runs:
-        write_table(compared.loop.trajectory, targets[compared.recorded.name])
-    write_json(figures, validation.to_dict())
+    write_or_keep(lambda path: _save(validation, path), output)
     article = closed_loop_article(validation, model.name or str(model), controller)
     if report is not None:
-        write_article(article, report)
+        write_or_keep(lambda path: write_article(article, path), report)
     if as_json:
         print_json(validation.to_dict())
     elif not quiet:
@@ -100,7 +101,7 @@ def closed_loop(
         print_article(replace(article, sections=article.sections[:2]))
         if kept := [n for n in surrogate.signals.names("controls") if n not in law.commands]:
             say(f"the controller does not set {', '.join(kept)}: as recorded", quiet)
-        say(f"wrote {output} ({len(runs)} runs) and {figures}", quiet)
+        say(f"wrote {output} ({len(runs)} runs) and {output / _FIGURES}", quiet)
         if report is not None:
             say(f"wrote {report}", quiet)
     for text in validation.endings():
@@ -108,6 +109,21 @@ def closed_loop(
             print(text, file=sys.stderr)
     if validation.completed < len(validation.runs):
         raise typer.Exit(1)
+
+
+def _file(run: Trajectory) -> str:
+    return f"{run.name}.parquet"
+
+
+def _save(validation: ClosedLoopValidation, path: Path) -> None:
+    """Write the runs' signals and the figures in one step."""
+    from dfsm.core.files import write_json, write_together
+    from dfsm.data.readers.tables import write_table
+
+    with write_together(path) as folder:
+        for compared in validation.runs:
+            write_table(compared.loop.trajectory, folder / _file(compared.recorded))
+        write_json(folder / _FIGURES, validation.to_dict())
 
 
 def pairs(texts: list[str]) -> dict[str, str]:

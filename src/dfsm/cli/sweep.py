@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from dfsm.cli.loops import loaded
 from dfsm.cli.terminal import AsJson, Quiet, fit_start, print_json, say, working
 from dfsm.errors import hushed, printable
+
+if TYPE_CHECKING:
+    from dfsm.loops.sweep import Sweep
+    from dfsm.report.article import Article
+
+_FIGURES, _TABLE, _PAGE = "sweep.json", "sweep.csv", "sweep.html"
 
 
 def sweep(
@@ -24,17 +30,14 @@ def sweep(
     """Close the loop with many gains over many runs: energy, loads, travel, extremes."""
     from dfsm.cli.tables import print_article
     from dfsm.config.sweep import load_sweep
-    from dfsm.core.files import check_file, write_file, write_json
+    from dfsm.core.fallback import write_or_keep
+    from dfsm.core.files import check_together
     from dfsm.loops.sweep import gain_grid
     from dfsm.loops.sweep import sweep as run_sweep
-    from dfsm.report.article_page import write_article
     from dfsm.report.sweep_article import sweep_article
 
     asked = load_sweep(config)
-    output.mkdir(parents=True, exist_ok=True)
-    figures, lines, page = (output / f"sweep.{end}" for end in ("json", "csv", "html"))
-    for target in (figures, lines, page):
-        check_file(target)
+    check_together(output, [_FIGURES, _TABLE, _PAGE])
     with working(quiet), hushed():
         found = loaded(asked, config.parent)
         controllers = gain_grid(found.controller, asked.gains, found.discon)
@@ -47,10 +50,7 @@ def sweep(
             settings=asked.settings(fit_start(found.model)),
         )
     article = sweep_article(swept, asked.exponent)
-    write_json(figures, swept.to_dict())
-    with write_file(lines) as temporary:
-        swept.table(asked.exponent).to_csv(temporary, index_label="controller")
-    write_article(article, page)
+    write_or_keep(lambda path: _save(swept, article, asked.exponent, path), output)
     if as_json:
         print_json(swept.to_dict())
     elif not quiet:
@@ -61,3 +61,13 @@ def sweep(
         print(printable(f"{name}: {text}"), file=sys.stderr)
     if ended:
         raise typer.Exit(1)
+
+
+def _save(swept: Sweep, article: Article, exponent: float, path: Path) -> None:
+    from dfsm.core.files import write_json, write_together
+    from dfsm.report.article_page import write_article
+
+    with write_together(path) as folder:
+        write_json(folder / _FIGURES, swept.to_dict())
+        swept.table(exponent).to_csv(folder / _TABLE, index_label="controller")
+        write_article(article, folder / _PAGE)

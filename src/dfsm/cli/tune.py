@@ -25,6 +25,7 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Tune a controller's gains on a model; goes on where it was ended."""
+    from dfsm.core.fallback import write_or_keep
     from dfsm.core.lock import locked
     from dfsm.loops.tuning_folder import (
         check_tuning_target,
@@ -41,7 +42,9 @@ def tune(
         known = open_journal(task, output)
         confirmed = _confirmed(config, task)
         result = task.tune() if confirmed is None else task.given(confirmed.values)
-        save_tuning(task, result, output, write_tuning_page, confirmed)
+        write_or_keep(
+            lambda path: save_tuning(task, result, path, write_tuning_page, confirmed), output
+        )
     if as_json:
         print_json(tuning_values(result, confirmed))
     elif not quiet:

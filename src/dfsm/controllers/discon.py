@@ -255,9 +255,14 @@ def write_discon(discon: Discon, path: str | Path) -> None:
     DfsmError
         The file cannot be written.
     """
-    text = "".join(discon.moved(path).lines)
     with write_file(path) as temporary:
-        temporary.write_bytes(text.encode("utf-8", errors="surrogateescape"))
+        temporary.write_bytes(discon_bytes(discon, path))
+
+
+def discon_bytes(discon: Discon, path: str | Path) -> bytes:
+    """Return what `write_discon` writes to a path."""
+    text = "".join(discon.moved(path).lines)
+    return text.encode("utf-8", errors="surrogateescape")
 
 
 def check_count(discon: Discon, counted: str, count: str) -> None:

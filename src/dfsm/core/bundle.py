@@ -129,8 +129,9 @@ def is_as_written(content: Mapping[str, Any], known: Collection[str]) -> bool:
     content
         What the file holds.
     known
-        The keys of such files in version 0.1, which had no digest; no other file may lack it.
+        The keys of such files in version 0.1, which had format 1 and no digest; no other file may
+        lack it.
     """
     if "checksum" not in content:
-        return set(content) <= set(known)
+        return content.get("format") == 1 and set(content) <= set(known)
     return content["checksum"] == checksum(content)

@@ -82,6 +82,110 @@ def write_folder(path: str | Path, *, is_ours: Callable[[Path], bool]) -> Iterat
             shutil.rmtree(temporary, ignore_errors=True)
 
 
+@contextmanager
+def write_together(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; on success `path` holds its files beside its own.
+
+    For results of several files that belong together, in a folder where others may lie. Whenever
+    the process is killed, all of them are the old ones or all are the new ones, and other files
+    stay. Where the folder cannot be replaced (the working folder, a mount point, one in a
+    read-only folder) or its file system has no hard links, each file is replaced in one step, one
+    after the other.
+
+    Raises
+    ------
+    DfsmError
+        `path` is a file, is being written by another process, or cannot be written.
+    """
+    check_together(path)
+    path = Path(path)
+    # The folder that a link points to is replaced, not the link.
+    path = path.resolve() if path.is_symlink() else path
+    fixed = _is_fixed(path)
+    with _sentences(path), locked(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        recover(path)
+        beside = None if fixed else path.parent
+        temporary = Path(tempfile.mkdtemp(prefix=beginning(path), dir=beside))
+        try:
+            yield temporary
+            temporary.chmod(0o777 & ~_umask())
+            files = sorted(temporary.iterdir())
+            for file in files:
+                file.chmod(0o666 & ~_umask())
+            if fixed or not _link_others(path, temporary):
+                _replace_each(files, path)
+            else:
+                exchange(temporary, path)
+                _bring_back(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_together(path: str | Path, names: Iterable[str] = ()) -> None:
+    """Fail where `write_together` would fail: call it before long work, not after.
+
+    Parameters
+    ----------
+    path
+        Folder of the results.
+    names
+        Files that will be written into it.
+
+    Raises
+    ------
+    DfsmError
+        `path` is a file, cannot be made, or holds a folder of one of these names.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise DfsmError(f"{path} is a file, a folder was expected: choose another name")
+    recover(path)
+    if path.is_dir():
+        for name in names:
+            _check_ordinary(path / name)
+    # The folders on the way are made when there is something to write.
+    above = path.absolute() if _is_fixed(path) else path.absolute().parent
+    while not above.exists():
+        above = above.parent
+    _check_parent(above / path.name)
+
+
+def _is_fixed(folder: Path) -> bool:
+    """Whether a folder can be written to but not be replaced by another."""
+    return folder.exists() and (
+        folder.samefile(Path.cwd()) or folder.is_mount() or not os.access(folder.parent, os.W_OK)
+    )
+
+
+def _replace_each(files: Iterable[Path], folder: Path) -> None:
+    for file in files:
+        with write_file(folder / file.name) as temporary:
+            shutil.copyfile(file, temporary)
+
+
+def _link_others(old: Path, new: Path) -> bool:
+    """Give what a folder holds another name in the one that replaces it; False where it cannot."""
+    try:
+        for entry in sorted(old.iterdir()) if old.is_dir() else ():
+            if (new / entry.name).exists():
+                continue
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.copytree(entry, new / entry.name, symlinks=True, copy_function=os.link)
+            else:
+                os.link(entry, new / entry.name, follow_symlinks=False)
+    except (OSError, shutil.Error):
+        return False
+    return True
+
+
+def _bring_back(old: Path, new: Path) -> None:
+    """Move what was put into a folder while it was being replaced."""
+    for entry in old.iterdir() if old.is_dir() else ():
+        if not (new / entry.name).exists():
+            entry.rename(new / entry.name)
+
+
 def visible(folder: Path) -> set[str]:
     """Names in a folder but for those that begin with a dot, which systems put there."""
     return {p.name for p in folder.iterdir() if not p.name.startswith(".")}

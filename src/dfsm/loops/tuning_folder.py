@@ -1,7 +1,7 @@
 """The folder of a tuning: what was computed on the way, and what came of it.
 
 ``evaluations.jsonl`` grows by a line with every evaluation, so that a tuning that was ended goes on
-where it stood; the rest is written when it is done, each file in one step.
+where it stood; the rest is written when it is done, all files in one step.
 """
 
 from __future__ import annotations
@@ -15,9 +15,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from dfsm.controllers.discon import write_discon
+from dfsm.controllers.discon import discon_bytes
 from dfsm.controllers.gains import numbers_of
-from dfsm.core.files import check_file, json_value, visible, write_file, write_json
+from dfsm.core.files import (
+    check_together,
+    json_value,
+    visible,
+    write_file,
+    write_json,
+    write_together,
+)
 from dfsm.core.version import __version__
 from dfsm.errors import DfsmError
 from dfsm.loops.trust_region import ConfirmedTuning
@@ -37,14 +44,11 @@ def check_tuning_target(folder: Path) -> None:
     DfsmError
         The folder holds what is not of a tuning, or cannot be written.
     """
-    if folder.exists() and not folder.is_dir():
-        raise DfsmError(f"{folder} is a file, a folder was expected: choose another name")
+    check_together(folder)
     if folder.exists() and (others := visible(folder) - OURS - {"truth"}):
         raise DfsmError(
             f"{folder} holds {sorted(others)[0]}, which no tuning wrote: choose another name"
         )
-    if not folder.exists():
-        check_file(folder)
 
 
 def open_journal(task: TuningTask, folder: Path) -> bool:
@@ -87,15 +91,16 @@ def save_tuning(
     DfsmError
         A file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    write_page(result, folder / PAGE)
-    if task.discon is not None:
-        theta = np.array(list(result.values.values()))
-        write_discon(task.deck(theta), folder / DECK)
-    else:
-        numbers = numbers_of(result.controller)
-        write_json(folder / GAINS, {n: np.asarray(v).tolist() for n, v in numbers.items()})
-    write_json(folder / FIGURES, tuning_values(result, confirmed))
+    with write_together(folder) as made:
+        write_page(result, made / PAGE)
+        if task.discon is not None:
+            theta = np.array(list(result.values.values()))
+            # Its paths count from where it will stand.
+            (made / DECK).write_bytes(discon_bytes(task.deck(theta), folder / DECK))
+        else:
+            numbers = numbers_of(result.controller)
+            write_json(made / GAINS, {n: np.asarray(v).tolist() for n, v in numbers.items()})
+        write_json(made / FIGURES, tuning_values(result, confirmed))
 
 
 def tuning_values(result: TuningResult, confirmed: ConfirmedTuning | None) -> dict[str, Any]:

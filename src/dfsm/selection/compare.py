@@ -39,7 +39,8 @@ from dfsm.models.model_folder import check_target, load, save
 from dfsm.selection.trial import Candidate, Course, Outcome, try_out
 
 HOLD_OUT = 0.2
-_FORMAT = 1
+# Those of format 1 may lack the checksum.
+_FORMAT = 2
 # Keys of results that version 0.1 wrote.
 _UNSIGNED = (
     *("format", "outcome", "model", "fingerprint", "changes", "settings", "refine"),
@@ -390,7 +391,7 @@ def _kept(output: Path, name: str, fingerprint: str) -> Outcome | None:
 def _read(path: Path) -> dict[str, Any] | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != _FORMAT or not is_as_written(content, _UNSIGNED):
+        if content["format"] not in (1, _FORMAT) or not is_as_written(content, _UNSIGNED):
             return None
         return content | {"outcome": TypeAdapter(Outcome).validate_python(content["outcome"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -27,7 +27,8 @@ from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.simulate import Simulation
 from dfsm.validation.growth import Growth
 
-_FORMAT = 1
+# Those of format 1 may lack the checksum.
+_FORMAT = 2
 _UNSIGNED = ("format", "dfsm", "level", "schedule", "grid", "channels", "runs", "warnings")
 _AGAIN = "make it again with dfsm calibrate"
 

@@ -233,6 +233,10 @@ def read_uniform(path: str | Path, settings: UniformSettings) -> UniformWind:
         wrong=lambda _: "correct it",
     )
     table = read_rows(rows, layout)
+    if not len(table.values):
+        raise DfsmError(
+            f"{path}: its only row is incomplete, a row of {width} was expected: redo it"
+        )
     columns = np.zeros((len(table.values), len(_COLUMNS)))
     columns[:, :width] = table.values
     _check(path, rows, columns)
