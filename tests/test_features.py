@@ -190,3 +190,62 @@ def test_a_lag_needs_an_equidistant_mesh():
     irregular = replace(run, time=run.time**1.01)
     with pytest.raises(DfsmError, match=r"feature 'w_lag1\.5' needs an equidistant mesh"):
         with_features(irregular, [LAG])
+
+
+# -- what acts before it arrives ------------------------------------------------------------------
+
+LEAD = Feature(source="w", kind="lead", seconds=1.5)
+
+
+@cache
+def led(seed: int) -> Trajectory:
+    """x' = -0.5 x + w(t + 1.5 s): waves whose force begins before they are told."""
+    w, ahead = wave(seed), np.interp(TIME + 1.5, TIME, wave(seed))
+    solved = solve_ivp(
+        lambda t, x: -0.5 * x + np.interp(t, TIME, ahead),
+        (0, TIME[-1]),
+        [0.0],
+        t_eval=TIME,
+        rtol=1e-9,
+        atol=1e-9,
+        max_step=0.05,
+    )
+    values = np.stack([solved.y[0], w], axis=1)
+    return Trajectory(TIME, values, (Channel("x", "m"), Channel("w", "m")), name=f"led{seed}")
+
+
+def test_a_lead_is_what_comes(tmp_path):
+    run = with_features(led(1), [LEAD])
+    shifted = run["w_lead1.5"]
+    np.testing.assert_allclose(shifted[:-30], run["w"][30:], atol=1e-12)
+    np.testing.assert_array_equal(shifted[-30:], run["w"][-1])
+    settings = FitSettings(
+        states=(StateSpec(name="x"),),
+        disturbances=("w",),
+        features=(LEAD,),
+        linear=LTI(),
+        corrective=NoCorrection(),
+        nonlinear_only=False,
+    )
+    model = fit([led(seed) for seed in range(1, 6)], settings).model
+    row = dict(zip([c.name for c in model.signals.inputs], model.f.coefficients[0, 0], strict=True))
+    assert abs(row["w_lead1.5"] - 1) < 2e-3
+    assert abs(row["w"]) < 2e-3
+    save(model, tmp_path / "m")
+    rollout = simulate(load(tmp_path / "m"), led(6)).trajectory
+    known = rollout.time < TIME[-1] - 1.5
+    error = rollout["x"] - led(6)["x"]
+    assert np.abs(error[known]).max() < 0.01 * led(6)["x"].std()
+
+
+def test_what_a_lead_does_not_know_is_left_out_of_a_fit():
+    settings = FitSettings(
+        states=(StateSpec(name="x"),),
+        disturbances=("w",),
+        features=(LEAD, replace(LEAD, source="w_lead1.5", seconds=2.0)),
+        corrective=NoCorrection(),
+    )
+    with pytest.raises(DfsmError, match=r"not known in its first 0 s and its last 3\.5 s"):
+        fit([led(1).window(0, 3.5), led(2).window(0, 3.5)], settings)
+    with pytest.raises(DfsmError, match=r"features\.seconds"):
+        Feature(source="w", kind="lead")

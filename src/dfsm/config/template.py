@@ -40,9 +40,9 @@ signals:
   controls: {controls}        # what an optimizer may choose
   # Known signals that nobody chooses. None of them may hold a response of the system.{wind_note}
   disturbances: {disturbances}
-  # Disturbances computed from others: a rate, a first-order lag or a delay of so many seconds, as
+  # Disturbances computed from others: a rate, a first-order lag, a delay or a lead, as
   # in [{{source: {example}, kind: rate}}, {{source: {example}, kind: lag, time_constant: 10}},
-  # {{source: {example}, kind: delay, seconds: 2}}]
+  # {{source: {example}, kind: lead, seconds: 4}}]
   features: {features}
   # Plant variables, constant within a run: channels, or values of runs whose files hold none, as
   # {{Ballast: {{run1.outb: 1.0, run2.outb: 1.2}}}} or the name of a CSV table.

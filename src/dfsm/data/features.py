@@ -1,4 +1,4 @@
-"""Inputs computed from disturbances: a rate, a copy that lags or is late, or a difference.
+"""Inputs computed from disturbances: a rate, a copy that lags, is late or early, or a difference.
 
 A force often follows from the history of a disturbance: wave forces from the elevation and its
 rate, the induced wind from the wind of the last seconds. Declared features are computed from a
@@ -43,25 +43,29 @@ class Feature:
         disturbance in the same unit, e.g. the wind over a ring of the rotor less that over the
         disk; named ``<source>-<less>``. ``"delay"``: the source so many seconds ago, as it was at
         first where the record does not go back so far; named ``<source>_delay<seconds>``. Only for
-        a delay the source may be a control; a model with one cannot be optimized.
+        a delay the source may be a control; a model with one cannot be optimized. ``"lead"``: the
+        source in so many seconds, as it is at last where the record ends before; named
+        ``<source>_lead<seconds>``. Waves reach a hull before they reach the point where their
+        elevation is told, so that their force begins before it (Falnes 1995, Applied Ocean Research
+        17, 379-386).
     time_constant
         τ of a lag in s.
     seconds
-        How late a delay is.
+        How late a delay is, how early a lead.
     less
         What a difference takes off.
     """
 
     source: str
-    kind: Literal["rate", "lag", "difference", "delay"] = "rate"
+    kind: Literal["rate", "lag", "difference", "delay", "lead"] = "rate"
     time_constant: float | None = None
     less: str | None = None
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        for key, kind in (("time_constant", "lag"), ("seconds", "delay")):
+        for key, kinds in (("time_constant", ("lag",)), ("seconds", ("delay", "lead"))):
             value: float | None = getattr(self, key)
-            if self.kind == kind:
+            if self.kind in kinds:
                 positive = value is not None and bool(np.isfinite(value)) and value > 0
                 require(positive, f"features.{key}", value, "a positive number of seconds")
             else:
@@ -82,8 +86,8 @@ class Feature:
             return f"{self.source}_dot"
         if self.kind == "difference":
             return f"{self.source}-{self.less}"
-        if self.kind == "delay":
-            return f"{self.source}_delay{self.seconds:g}"
+        if self.kind in ("delay", "lead"):
+            return f"{self.source}_{self.kind}{self.seconds:g}"
         return f"{self.source}_lag{self.time_constant:g}"
 
 
@@ -117,7 +121,8 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
         elif feature.kind == "lag":
             values, unit = _lagged(made, feature), source.unit
         elif feature.seconds is not None:
-            values = np.interp(made.time - feature.seconds, made.time, made[source.name])
+            later = feature.seconds if feature.kind == "lead" else -feature.seconds
+            values = np.interp(made.time + later, made.time, made[source.name])
             unit = source.unit
         else:
             _require_one_unit(made, source, others[0])
@@ -146,13 +151,16 @@ def _made_of(
     return part.require_finite()
 
 
-def unknown_until(features: Iterable[Feature]) -> float:
-    """Seconds from the start of a record in which a delay asks for what was before it."""
+def unknown_ends(features: Iterable[Feature]) -> tuple[float, float]:
+    """Seconds at the start and the end of a record in which features ask for what is not in it."""
     late: dict[str, float] = {}
+    early: dict[str, float] = {}
     for feature in features:
-        before = max(late.get(source, 0.0) for source in feature.sources)
-        late[feature.name] = before + (feature.seconds or 0.0)
-    return max(late.values(), default=0.0)
+        for known, kind in ((late, "delay"), (early, "lead")):
+            before = max(known.get(source, 0.0) for source in feature.sources)
+            own = feature.seconds if feature.kind == kind else None
+            known[feature.name] = before + (own or 0.0)
+    return max(late.values(), default=0.0), max(early.values(), default=0.0)
 
 
 def acting_late(features: Iterable[Feature], controls: Iterable[str]) -> dict[str, str]:

@@ -154,6 +154,8 @@ def computed_inputs(model: DFSM) -> list[str]:
             how = f"{source} after a first-order lag of {feature.time_constant:g} s"
         elif feature.kind == "delay":
             how = f"{source} as it was {feature.seconds:g} s ago"
+        elif feature.kind == "lead":
+            how = f"{source} as it will be in {feature.seconds:g} s"
         else:
             how = f"{source} less {feature.less}"
         unit = units.get(feature.name, "")

@@ -8,7 +8,7 @@ from dfsm.data.signs import held_interval, wrap_notes
 from dfsm.data.stuck import stuck_notes
 from dfsm.data.wind import wind_warning
 from dfsm.fitting.held_inputs import held_note, held_unseen
-from dfsm.fitting.samples import Samples, known_from
+from dfsm.fitting.samples import Samples, known_window
 from dfsm.fitting.settings import FitSettings
 
 
@@ -65,7 +65,7 @@ def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict
     if isinstance(chosen, str) or samples.weights is not None:
         return {}
     names, states = samples.signals.driving, [s.name for s in settings.states]
-    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
+    runs = [run.window(*known_window(run, settings)) for run in data]
     found = held_unseen(
         lambda: ((run.select(states).values, run.select(names).values) for run in runs)
     )
