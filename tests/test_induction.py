@@ -68,9 +68,13 @@ def steady() -> RotorTerm:
     return ROTOR.term(CHANNELS, COLUMNS)
 
 
-@pytest.fixture(scope="module")
-def lagging(steady) -> RotorTerm:
-    return steady.lagging("rotor.induced", WAKE)
+STATES = ("rotor.induced", "rotor.induced_slow")
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def lagging(request, steady) -> RotorTerm:
+    """With one state, as in models made before there were two, and with two."""
+    return steady.lagging(STATES[: request.param], WAKE)
 
 
 def induction(thrust_coefficient: float) -> float:
@@ -94,20 +98,22 @@ OPERATING = np.array(
 
 
 def inputs_of(signals: jax.Array) -> jax.Array:
-    """I of wind, speed, pitch and induced velocity, shape ``(..., 4)`` to ``(..., 5)``."""
-    wind, speed, pitch, induced = jnp.moveaxis(signals, -1, 0)
-    return jnp.stack([jnp.zeros_like(wind), pitch, wind, speed, induced], axis=-1)
+    """I of wind, speed, pitch and the wake's states, ``(..., 3 + n)`` to ``(..., 4 + n)``."""
+    wind, speed, pitch, *induced = jnp.moveaxis(signals, -1, 0)
+    return jnp.stack([jnp.zeros_like(wind), pitch, wind, speed, *induced], axis=-1)
 
 
 def test_a_settled_wake_has_the_forces_of_the_table(steady, lagging):
     rng = np.random.default_rng(0)
-    low, high = [-20.0, -1.0, -12.0, 0.0], [40.0, 15.0, 40.0, 0.0]
-    at = jnp.asarray(rng.uniform(low, high, (300, 4)))
-    settled, lags = jax.vmap(lagging.wake)(inputs_of(at))
-    values = jax.vmap(lagging.values)(at.at[:, 3].set(settled))
-    plain = jax.vmap(steady.values)(at[:, :3])
+    at = jnp.asarray(rng.uniform([-20.0, -1.0, -12.0], [40.0, 15.0, 40.0], (300, 3)))
+    count = lagging.about.lags
+    rest = jnp.concatenate([at, jnp.zeros((300, count))], axis=1)
+    settled, lags = jax.vmap(lagging.wake)(inputs_of(rest))
+    values = jax.vmap(lagging.values)(rest.at[:, 3:].set(settled[:, None]))
+    plain = jax.vmap(steady.values)(at)
     np.testing.assert_allclose(values[:, :2], plain, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(values[:, 2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(values[:, 2:], 0.0, atol=1e-12)
+    assert values.shape == (300, 2 + count)
     assert (lags > 0).all()
     assert (np.abs(settled) <= np.abs(at[:, 0])).all()
 
@@ -121,27 +127,40 @@ def test_forces_and_lag_before_it_has_settled(lagging):
         tips = rpm * np.pi / 30 * RADIUS
         axial = partial(inflow_of, thrust, tips, pitch)
         settled = wind - axial(wind)
+        still = [wind, rpm, pitch, *[0.0] * lagging.about.lags]
+        own = float(lagging.wake(inputs_of(jnp.array(still)))[0])
+        assert own == pytest.approx(settled, rel=0.01)
         for change in (-0.5, 0.3):
-            # Four tenths of the induced velocity have settled at once.
-            inflow = axial(wind) - 0.6 * change
+            # Of one state alone four tenths of the induced velocity have settled at once.
+            two, now = lagging.about.lags == 2, 0.6 * change
+            inflow = axial(wind) - now
             seen = brentq(partial(apart, axial, inflow), 0.8 * wind, 1.25 * wind)
             expected = np.array(
                 [thrust.ev(tips / seen, pitch), RADIUS * torque.ev(tips / seen, pitch)]
             )
-            values = np.asarray(lagging.values(jnp.array([wind, rpm, pitch, settled + change])))
+            slow = -2 * change if two else change
+            states = [own + now, own + slow][-lagging.about.lags :]
+            values = np.asarray(lagging.values(jnp.array([wind, rpm, pitch, *states])))
             np.testing.assert_allclose(values[:2], size * seen**2 * expected, rtol=0.005)
             lag = 1.1 * RADIUS / (wind - 1.3 * settled)
-            assert values[2] == pytest.approx(-change / lag, rel=0.08)
+            assert values[-1] == pytest.approx(-slow / lag, rel=0.08)
+            if two:
+                # Six tenths of what has settled are followed at a quarter of the lag.
+                quick = (0.4 * slow - now) / (0.25 * lag)
+                assert values[2] == pytest.approx(quick, rel=0.08)
 
 
 def test_it_is_smooth_and_finite_everywhere(lagging):
     rng = np.random.default_rng(1)
-    at = rng.uniform([-70, -1, -90, -60], [70, 25, 90, 60], (400, 4))
-    at[:8, 0], at[4:12, 1], at[2:6, 3] = 0.0, 0.0, 0.0
+    more = lagging.about.lags
+    low, high = [-70, -1, -90, *[-60] * more], [70, 25, 90, *[60] * more]
+    at = rng.uniform(low, high, (400, 3 + more))
+    at[:8, 0], at[4:12, 1], at[2:6, 3:] = 0.0, 0.0, 0.0
     second = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(lagging.values))))(jnp.asarray(at))
     assert np.isfinite(np.asarray(second)).all()
     # From behind, through no wind and the table, and beyond: no step in the second derivative.
-    a, b = jnp.array([-9.0, 7.0, 2.0, 2.0]), jnp.array([30.0, 7.0, 2.0, 2.0])
+    still = [7.0, 2.0, *[2.0] * more]
+    a, b = jnp.array([-9.0, *still]), jnp.array([30.0, *still])
     bend = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(lambda t: lagging.values(a + t * (b - a))))))
     fine = [np.asarray(bend(jnp.linspace(0, 1, n))) for n in (20001, 40001)]
     steps = [np.abs(np.diff(f, axis=0)).max(axis=0) for f in fine]
@@ -159,17 +178,17 @@ def recorded(seed: int, mean: float, pace: Array | None = None) -> Trajectory:
     pitch = 1.0 + wander(rng, 2.0, 2.0, 0.2)(time)
     torque = wander(rng, 8e3, 3e3, 0.2)(time) * (mean / 9) ** 2
     term = replace(
-        ROTOR.term(CHANNELS, COLUMNS).lagging("rotor.induced", WAKE),
-        pace=jnp.zeros(2) if pace is None else jnp.asarray(pace),
+        ROTOR.term(CHANNELS, COLUMNS).lagging(STATES, WAKE),
+        pace=jnp.zeros(3) if pace is None else jnp.asarray(pace),
     )
     driven = jnp.stack([jnp.asarray(c) for c in (wind, pitch, torque)], axis=1)
-    x0 = jnp.array([5.5, 0.0])
-    start = inputs_of(jnp.array([wind[0], x0[0], pitch[0], 0.0]))
-    x0 = x0.at[1].set(term.wake(start)[0])
+    x0 = jnp.array([5.5, 0.0, 0.0])
+    start = inputs_of(jnp.array([wind[0], x0[0], pitch[0], 0.0, 0.0]))
+    x0 = x0.at[1:].set(term.wake(start)[0])
 
     def rate(x, v):
-        _, torque, slow = term.values(jnp.array([v[0], x[0], v[1], x[1]]))
-        return jnp.array([(torque - v[2]) * 1e3 / 318.6e6 * 30 / np.pi, slow])
+        _, torque, *wake = term.values(jnp.array([v[0], x[0], v[1], *x[1:]]))
+        return jnp.array([(torque - v[2]) * 1e3 / 318.6e6 * 30 / np.pi, *wake])
 
     def march(x, pair):
         first, last = pair
@@ -187,7 +206,7 @@ def recorded(seed: int, mean: float, pace: Array | None = None) -> Trajectory:
 
 
 # The truth's wake lags by three times Øye's.
-SLOW = np.array([np.arctanh(np.log(3) / np.log(4)), 0.0])
+SLOW = np.array([np.arctanh(np.log(3) / np.log(4)), 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -202,18 +221,19 @@ def model(runs) -> dfsm.DFSM:
 
 
 def wake_of(model: dfsm.DFSM, run: Trajectory, at: int) -> float:
-    signals = jnp.array([*(run[n][at] for n in ("Wind", "Speed", "Pitch")), 0.0])
+    signals = jnp.array([*(run[n][at] for n in ("Wind", "Speed", "Pitch")), 0.0, 0.0])
     return float(model.terms.parts[0].wake(inputs_of(signals))[0])
 
 
 def test_the_wake_is_a_hidden_state_that_has_settled_at_the_start(model, runs, tmp_path):
-    assert model.signals.names("states") == ("Speed", "rotor.induced")
-    assert [c.name for c in model.terms.channels][-1] == "rotor.induced_rate"
+    assert model.signals.names("states") == ("Speed", *STATES)
+    assert [c.name for c in model.terms.channels][-2:] == [f"{n}_rate" for n in STATES]
     late = replace(runs[2], time=runs[2].time + 20)
     rollout = dfsm.simulate(model, late, start=60.0).trajectory
     k = int(np.searchsorted(late.time, 60.0))
-    assert rollout["rotor.induced"][0] == pytest.approx(wake_of(model, late, k), rel=1e-6)
-    assert np.ptp(rollout["rotor.induced"]) > 0.1
+    for name in STATES:
+        assert rollout[name][0] == pytest.approx(wake_of(model, late, k), rel=1e-6)
+        assert np.ptp(rollout[name]) > 0.1
     given = dfsm.simulate(model, late, start=60.0, initial=[late["Speed"][k]]).trajectory
     np.testing.assert_array_equal(given.values, rollout.values)
     dfsm.save(model, tmp_path / "model")
@@ -242,7 +262,7 @@ def test_an_optimum_begins_with_the_wake_of_the_record(model, runs):
 
 def test_exports_have_the_wake(model):
     exported = dfsm.to_casadi(model)
-    x, u, w = [5.8, 1.7], [8e3, 2.0], [9.0]
+    x, u, w = [5.8, 1.7, 1.9], [8e3, 2.0], [9.0]
     ours = np.asarray(model.derivative(x, u, w))
     theirs = exported.f(x, u, w, [])
     np.testing.assert_allclose(np.asarray(theirs).ravel(), ours, rtol=1e-11)
@@ -252,7 +272,7 @@ def test_exports_have_the_wake(model):
 def test_slopes_agree_with_differences(model, runs, length):
     record = record_of(model, runs[0], 0.5, 0.0, 30.0)
     wide = start_latents(model, [record], 2, np.array([0.05]))
-    assert wide.signals.names("states") == ("Speed", "rotor.induced", "latent1", "latent2")
+    assert wide.signals.names("states") == ("Speed", *STATES, "latent1", "latent2")
     parameters = Parametrization.of(wide, np.array([0.05]))
     problem = RolloutError(parameters, [[record]], length, ErrorWeights(np.ones(1)))
     at = 0.003 * np.random.default_rng(0).normal(size=parameters.size)

@@ -89,13 +89,13 @@ def test_a_staged_rotor_has_the_same_forces(lags):
     schedule = Schedule(COLUMNS["Wind"], np.array([6.0, 9.0, 15.0]))
     first = len(UNITS)
     if lags:
-        term, first = term.lagging("induced", first), first + 1
+        term, first = term.lagging(("induced", "slow"), first), first + 2
     late = term.with_latents(["l0", "l1"], first, np.array([0.4, -0.2]), schedule)
     moved = late.moved([jnp.asarray(RNG.normal(size=a.shape)) for a in late.parameters])
     low, high = [2, 0, -8, -1, -1, -2, -2, -1, -1, 4], [25, 9, 40, 1, 1, 2, 2, 1, 1, 18]
     rows = RNG.uniform(low, high, (40, 10))
     if lags:
-        rows = np.insert(rows, 7, RNG.uniform(0, 5, 40), axis=1)
+        rows = np.insert(rows, [7, 7], RNG.uniform(0, 5, (40, 2)), axis=1)
     signals, ready = jnp.asarray(rows), moved.staged()
     both = jax.jit(jax.vmap(lambda row: (ready.of_numbers(list(row)), moved.values(row))))
     forces, expected = map(np.asarray, both(signals))

@@ -89,10 +89,10 @@ def known_coefficients(
     return KnownCoefficients(fixed, first, balances)
 
 
-def wakes_of(terms: Sequence[TermSettings]) -> dict[int, str]:
-    """What the induced velocities of rotors that lag are called, by place of the term."""
+def wakes_of(terms: Sequence[TermSettings]) -> dict[int, tuple[str, ...]]:
+    """What states of the induced velocities of rotors are called, by place of the term."""
     return {
-        place: f"{rotor.name}.induced"
+        place: (f"{rotor.name}.induced", f"{rotor.name}.induced_slow")
         for place, rotor in enumerate(terms)
         if isinstance(rotor, Rotor) and rotor.induction == "lag"
     }

@@ -1,14 +1,12 @@
 """Induced velocities of rotors as states of a model, see `terms.induction`.
 
-    Ẇ = (W_s(I) - W) / τ(I)
-
 They stand before all other latent states, in rows that hold nothing but the rate that the rotor's
 term gives. Where a rollout begins they have settled; along a record they follow what was recorded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -21,29 +19,30 @@ from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 from dfsm.models.terms import RotorTerm, Terms
+from dfsm.models.terms.induction import quickness, share_at_once
 from dfsm.models.wider import with_more_states
 
 # Shorter steps, as shares of the lag, change nothing.
 _SHORTEST = 1e-9
 
 
-def _lagging(model: DFSM) -> list[tuple[RotorTerm, int]]:
-    """Terms with a wake and the column of its state."""
+def _lagging(model: DFSM) -> list[RotorTerm]:
+    """Terms with a wake."""
     parts = () if model.terms is None else model.terms.parts
-    rotors = [part for part in parts if isinstance(part, RotorTerm)]
-    return [(r, r.wake_column) for r in rotors if r.wake_column is not None]
+    return [part for part in parts if isinstance(part, RotorTerm) and part.about.lags]
 
 
 def wake_columns(model: DFSM) -> list[int]:
-    """Where the induced velocities of its rotors stand in I."""
-    return [column for _, column in _lagging(model)]
+    """Where the states of its rotors' induced velocities stand in I."""
+    return [column for rotor in _lagging(model) for column in rotor.wake_columns]
 
 
 def settled_wakes(model: DFSM, inputs: jax.Array) -> jax.Array:
     """Input vectors ``(..., input)`` with the induced velocities that they lead to."""
-    for rotor, column in _lagging(model):
+    for rotor in _lagging(model):
         settled = jnp.vectorize(rotor.wake, signature="(i)->(),()")(inputs)[0]
-        inputs = inputs.at[..., column].set(settled)
+        for column in rotor.wake_columns:
+            inputs = inputs.at[..., column].set(settled)
     return inputs
 
 
@@ -94,26 +93,36 @@ def wakes_along(
     none = jnp.zeros((len(states), s.induced))
     x = jnp.concatenate([states, none, pairs], axis=1)
     inputs = model.join(x, *s.order.split_exogenous(exogenous))
-    for rotor, _ in _lagging(model):
+    for rotor in _lagging(model):
         settled, lags = jax.vmap(rotor.wake)(inputs)
-        x = jnp.maximum(h * (1 / lags[1:] + 1 / lags[:-1]) / 2, _SHORTEST)
-        kept = jnp.exp(-x)
-        mean = -jnp.expm1(-x) / x
-        added = (mean - kept) * settled[:-1] + (1 - mean) * settled[1:]
-
-        def step(w: jax.Array, along: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            w = along[0] * w + along[1]
-            return w, w
-
-        path = jax.lax.scan(step, settled[0], (kept, added))[1]
-        paths.append(jnp.concatenate([settled[:1], path]))
+        slow = _following(settled, lags, h)
+        if rotor.about.lags > 1:
+            k = share_at_once(rotor.pace, rotor.about.lags)
+            quick = quickness(rotor.pace) * lags
+            paths.append(_following(k * settled + (1 - k) * slow, quick, h))
+        paths.append(slow)
     return jnp.stack(paths, axis=1) if paths else jnp.zeros((len(inputs), 0))
+
+
+def _following(target: jax.Array, lags: jax.Array, h: jax.Array | float) -> jax.Array:
+    """What follows a target that is linear within steps with a lag, there at first, ``(time,)``."""
+    x = jnp.maximum(h * (1 / lags[1:] + 1 / lags[:-1]) / 2, _SHORTEST)
+    kept = jnp.exp(-x)
+    mean = -jnp.expm1(-x) / x
+    added = (mean - kept) * target[:-1] + (1 - mean) * target[1:]
+
+    def step(w: jax.Array, along: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        w = along[0] * w + along[1]
+        return w, w
+
+    path = jax.lax.scan(step, target[0], (kept, added))[1]
+    return jnp.concatenate([target[:1], path])
 
 
 # -- adding them to a model ---------------------------------------------------------------------
 
 
-def with_wakes(model: DFSM, names: Mapping[int, str], inputs: Array) -> DFSM:
+def with_wakes(model: DFSM, names: Mapping[int, Sequence[str]], inputs: Array) -> DFSM:
     """A model in which the induced velocities of some rotors are states.
 
     Parameters
@@ -133,9 +142,10 @@ def with_wakes(model: DFSM, names: Mapping[int, str], inputs: Array) -> DFSM:
     terms, s = model.terms, model.signals
     if terms is None or not names:
         return model
-    at, count = s.state_columns.stop, len(names)
+    called = [name for states in names.values() for name in states]
+    at, count = s.state_columns.stop, len(called)
     taken = {c.name for c in (*s.inputs, *s.outputs, *terms.channels)}
-    for name in names.values():
+    for name in called:
         if {name, f"{name}_rate"} & taken:
             raise DfsmError(
                 f"the induced velocity of a rotor is called '{name}', as another signal is: give "
@@ -144,7 +154,7 @@ def with_wakes(model: DFSM, names: Mapping[int, str], inputs: Array) -> DFSM:
     lagging = _with_lags(terms.with_more_inputs(at, count), names, at)
     wide = jnp.asarray(np.insert(inputs, [at] * count, 0.0, axis=1))
     wide = settled_wakes(replace(model, terms=lagging), wide)
-    channels = tuple(Channel(name, "m/s") for name in names.values())
+    channels = tuple(Channel(name, "m/s") for name in called)
     coupling = np.zeros((len(s.states), count))
     more = with_more_states(model, channels, coupling, [np.asarray(wide[:, at : at + count])])
     more = replace(more, signals=replace(more.signals, induced=count), terms=lagging)
@@ -158,22 +168,23 @@ def with_wakes(model: DFSM, names: Mapping[int, str], inputs: Array) -> DFSM:
     return replace(more, terms=lagging, region=region)
 
 
-def _with_lags(terms: Terms, names: Mapping[int, str], at: int) -> Terms:
+def _with_lags(terms: Terms, names: Mapping[int, Sequence[str]], at: int) -> Terms:
     parts = list(terms.parts)
-    for k, (place, name) in enumerate(names.items()):
+    for place, states in names.items():
         rotor = parts[place]
         if not isinstance(rotor, RotorTerm):
             raise TypeError("only rotors have wakes")
-        parts[place] = rotor.lagging(name, at + k)
+        parts[place] = rotor.lagging(states, at)
+        at += len(states)
     return replace(terms, parts=tuple(parts))
 
 
-def _with_rates(model: DFSM, before: Terms, names: Mapping[int, str]) -> DFSM:
+def _with_rates(model: DFSM, before: Terms, names: Mapping[int, Sequence[str]]) -> DFSM:
     """The model whose linear fits take the rates, which no other row than their own uses."""
     s, n = model.signals, len(model.signals.inputs)
     ends = np.cumsum([len(part.channels) for part in before.parts])
-    # Every rate comes last of its term; those before it have moved it on.
-    places = [n + int(ends[place]) for place in names]
+    # Rates come last of their term; those before it have moved them on.
+    places = [n + int(ends[place]) for place, states in names.items() for _ in states]
     L = np.insert(np.asarray(model.f.coefficients), places, 0.0, axis=2)
     columns = [place + k for k, place in enumerate(places)]
     known = {(row, c + sum(p <= c for p in places)) for row, c in model.f.known}

@@ -1,15 +1,18 @@
-"""Dynamic inflow: the induced velocity of a rotor follows its thrust with a lag.
+"""Dynamic inflow: the induced velocity of a rotor follows its thrust with two lags.
 
 A table of coefficients holds what a rotor gives when its wake has settled. Blades see the wind less
 the induced velocity, which needs the time in which some rotor radii of wind go by to change. With v
-the undisturbed wind, W the induced velocity and a(Ct) the induction of momentum theory, here one
-first-order lag of the settled value,
+the undisturbed wind, W the induced velocity, a(Ct) the induction of momentum theory and Z the part
+of W that is slow,
 
-    Ẇ = (a v - W) / τ        τ = c · 1.1 R / (v - 1.3 a v)
+    Ż = (a v - Z) / τ                        τ = c · 1.1 R / (v - 1.3 a v)
+    Ẇ = (k a v + (1 - k) Z - W) / (q τ)      k = 0.6, q = 0.25
 
-(Øye 1990, as in Hansen, Aerodynamics of Wind Turbines, Sec. 9.3, whose second lag is a quarter of
-this one; c is learnt). The table is read at the wind v* at which the settled rotor, turning as it
-does now, would have the inflow v - W that its blades have now: (1 - a*) v* = v - W. To first order
+(Øye 1990, as in Hansen, Aerodynamics of Wind Turbines, Sec. 9.3, q at three quarters of the radius;
+c, k and q are learnt). Where there is one state alone, as in models made before there were two,
+it is Z, and W = k a v + (1 - k) Z. The table is read at the wind v* at which the settled rotor,
+turning as it does now, would have the inflow v - W that its blades have now: (1 - a*) v* = v - W.
+To first order
 
     v* = v + (a v - W) / s        s = ∂/∂v [(1 - a) v]
 
@@ -38,9 +41,11 @@ _CALM = 0.15
 # speed of the tips adds to that wind where it dies away.
 _FARTHEST, _SLOWEST, _TIPS = 0.5, 0.35, 0.02
 _SMALL = 1e-2  # m/s
-# The learnt factor c stays between 1 / this and this; k at first.
+# The learnt factor c stays between 1 / this and this, and so does that of q; k at first with one
+# state and with two, q at first.
 _PACE = np.log(4.0)
-_SHARE = 0.4
+_SHARE = {1: 0.4, 2: 0.6}
+_QUICK = 0.25
 
 
 def make_induction(weights: Array, grid: Grid) -> Array:
@@ -74,7 +79,7 @@ def settled(
 
 
 def wind_of_inflow(
-    wind: jax.Array, tips: jax.Array, missing: jax.Array, slope: jax.Array, pace: jax.Array
+    wind: jax.Array, tips: jax.Array, missing: jax.Array, slope: jax.Array
 ) -> jax.Array:
     """v* in m/s at which the table is read.
 
@@ -84,19 +89,50 @@ def wind_of_inflow(
         v and the speed of the tips in m/s.
     missing, slope
         a v - W and s.
-    pace
-        What is learnt of c and k, 0 for 1 and 0.4, shape ``(2,)``.
     """
     size = _FARTHEST * jnp.sqrt(wind**2 + (_TIPS * tips) ** 2 + _SMALL**2)
-    slow = 1 - jax.nn.sigmoid(pace[1] + np.log(_SHARE / (1 - _SHARE)))
-    share = slow * missing / slope / size
+    share = missing / slope / size
     return wind + size * share / jnp.sqrt(jnp.sqrt(1 + share**4))
 
 
 def lag(
     radius: float, wind: jax.Array, tips: jax.Array, induced: jax.Array, pace: jax.Array
 ) -> jax.Array:
-    """τ in s; `induced` is a v, the others as for `wind_of_inflow`."""
+    """τ in s; `induced` is a v, `pace` what is learnt of c, k and q, 0 for their first values."""
     least = (_SLOWEST * wind) ** 4 + (_TIPS * tips) ** 4 + _SMALL**4
     speed = jnp.sqrt(jnp.sqrt((wind - 1.3 * induced) ** 4 + least))
     return 1.1 * radius * jnp.exp(_PACE * jnp.tanh(pace[0])) / speed
+
+
+def share_at_once(pace: jax.Array, states: int) -> jax.Array:
+    """k, with one state or two."""
+    first = _SHARE[states]
+    return jax.nn.sigmoid(pace[1] + np.log(first / (1 - first)))
+
+
+def quickness(pace: jax.Array) -> jax.Array:
+    """q, of two states."""
+    return _QUICK * jnp.exp(_PACE * jnp.tanh(pace[2]))
+
+
+def moving_wake(
+    still: jax.Array, first: jax.Array, states: jax.Array, pace: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What a v - W is in m/s, and the rates of the states in m/s².
+
+    Parameters
+    ----------
+    still, first
+        a v and τ.
+    states
+        Z alone, or W and Z, shape ``(state,)``.
+    pace
+        See `lag`.
+    """
+    slow, k = states[-1], share_at_once(pace, len(states))
+    between = k * still + (1 - k) * slow
+    rate = (still - slow) / first
+    if len(states) == 1:
+        return still - between, rate[None]
+    now = states[0]
+    return still - now, jnp.stack([(between - now) / (quickness(pace) * first), rate])

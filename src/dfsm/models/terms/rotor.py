@@ -68,10 +68,11 @@ class Rotor:
         Share by which the table's thrust and torque may well be off: with one above 0 refinement
         learns smooth factors of both, quadratic in blade pitch and inflow.
     induction
-        ``"steady"``: the table holds at every moment. ``"lag"``: what the wake has settled to is a
-        hidden state ``<name>.induced`` in m/s, which follows momentum theory with a lag, and the
-        table is read at the wind that has the blades' present inflow; see `terms.induction`. A
-        steady state has the table's forces. Refinement learns the lag within a factor of four.
+        ``"steady"``: the table holds at every moment. ``"lag"``: the induced velocity is a hidden
+        state ``<name>.induced`` in m/s, which follows momentum theory with two lags, as its slow
+        part ``<name>.induced_slow`` does with one, and the table is read at the wind that has the
+        blades' present inflow; see `terms.induction`. A steady state has the table's forces.
+        Refinement learns the lags within a factor of four.
     name
         What the values are called: ``<name>.thrust`` in kN and ``<name>.torque`` in kN-m.
     """

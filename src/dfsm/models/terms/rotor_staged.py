@@ -35,7 +35,7 @@ class StagedRotor(RotorTerm):
             moving = moving + rest.pop(0)
         for k in range(self.gains.shape[0]):
             wind = wind + self.gains[k] * rest.pop(0)
-        induced = rest.pop(0) if about.lags else None
+        induced = jnp.array([rest.pop(0) for _ in range(about.lags)])
         if latents := self.late.shape[1] - 1:
             late = hats(self.grid_of_late, rest[latents]) @ self.late
             wind = wind + late[-1]

@@ -15,7 +15,13 @@ from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel
 from dfsm.models.terms.form import Schedule, Term
-from dfsm.models.terms.induction import lag, make_induction, settled, wind_of_inflow
+from dfsm.models.terms.induction import (
+    lag,
+    make_induction,
+    moving_wake,
+    settled,
+    wind_of_inflow,
+)
 from dfsm.models.terms.rotor_check import check_signals
 from dfsm.models.terms.rotor_surface import TOLERANCE, Grid, surface_values
 from dfsm.numerics.hats import hats
@@ -53,7 +59,8 @@ class RotorConstants:
     error
         Of the splines against the table, see `make_surface`.
     lags
-        Whether the induced velocity is a state, whose rate is the third value; see `induction`.
+        How many states the induced velocity has, whose rates come after the forces; see
+        `induction`.
     """
 
     inputs: tuple[str, ...]
@@ -74,7 +81,7 @@ class RotorConstants:
     speed_unit: str
     pitch_unit: str
     error: float
-    lags: bool = False
+    lags: int = 0
 
 
 class RotorTerm(Term):
@@ -98,8 +105,8 @@ class RotorTerm(Term):
     trim
         Coefficients of `factors`, shape ``(2, 6)``.
     induction, pace
-        Splines of `make_induction`, and what is learnt of its lag, shape ``(2,)``; the
-        first is empty where nothing lags.
+        Splines of `make_induction`, empty where nothing lags, and what is learnt of its lags, see
+        `lag`, shape ``(2,)`` with one state and ``(3,)`` with two.
     grid
         Where the splines lie.
     about
@@ -123,25 +130,23 @@ class RotorTerm(Term):
     def values(self, signals: jax.Array) -> jax.Array:
         """Thrust in kN and torque in kN m at one sample, shape ``(signal,)`` to ``(2,)``.
 
-        With a lag the rate of the induced velocity in m/s² is the last of three.
+        With lags the rates of the induced velocity's states in m/s² come after them.
         """
-        induced = signals[self._induced] if self.about.lags else None
-        return self.felt(self.inflow(signals), induced)
+        first = self._induced
+        return self.felt(self.inflow(signals), signals[first : first + self.about.lags])
 
-    def felt(
-        self, inflow: tuple[jax.Array, jax.Array, jax.Array], induced: jax.Array | None
-    ) -> jax.Array:
-        """The values at what `inflow` tells, and the induced velocity if it lags."""
+    def felt(self, inflow: tuple[jax.Array, jax.Array, jax.Array], induced: jax.Array) -> jax.Array:
+        """The values at what `inflow` tells and the induced velocity's states, ``(lags,)``."""
         wind, speed, pitch = inflow
         # No direction of the inflow is lost: only its angle is asked of the spline.
         tips = jnp.sqrt(speed**2 + _CALM**2)
-        if induced is None:
+        if not self.about.lags:
             return self._forces(wind, tips, pitch)
         still, slope = settled(self.induction, self.grid, wind, tips, pitch)
-        missing = still - induced
-        rate = missing / lag(self.about.radius, wind, tips, still, self.pace)
-        seen = wind_of_inflow(wind, tips, missing, slope, self.pace)
-        return jnp.append(self._forces(seen, tips, pitch), rate)
+        first = lag(self.about.radius, wind, tips, still, self.pace)
+        missing, rates = moving_wake(still, first, induced, self.pace)
+        seen = wind_of_inflow(wind, tips, missing, slope)
+        return jnp.concatenate([self._forces(seen, tips, pitch), rates])
 
     def staged(self) -> Term:
         """See `Term.staged`."""
@@ -150,7 +155,7 @@ class RotorTerm(Term):
         return staged_rotor(self)
 
     def wake(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Settled induced velocity in m/s and the lag in s, ``(input,)`` to numbers."""
+        """Settled induced velocity in m/s and the slow lag in s, ``(input,)`` to numbers."""
         wind, speed, pitch = self.inflow(inputs[np.array(self.columns, dtype=int)])
         tips = jnp.sqrt(speed**2 + _CALM**2)
         induced, _ = settled(self.induction, self.grid, wind, tips, pitch)
@@ -179,7 +184,7 @@ class RotorTerm(Term):
 
     @property
     def _induced(self) -> int:
-        """Where the induced velocity stands among the signals."""
+        """Where the first state of the induced velocity stands among the signals."""
         motions = (self.about.arm is not None) + self.about.surges
         return 3 + motions + self.gains.shape[0]
 
@@ -258,25 +263,28 @@ class RotorTerm(Term):
         )
 
     @property
-    def wake_column(self) -> int | None:
-        """Column in I of the induced velocity, where it is a state."""
-        return self.columns[self._induced] if self.about.lags else None
+    def wake_columns(self) -> tuple[int, ...]:
+        """Columns in I of the induced velocity's states."""
+        return self.columns[self._induced : self._induced + self.about.lags]
 
-    def lagging(self, name: str, column: int) -> RotorTerm:
-        """The term of a model in which the induced velocity is a state.
+    def lagging(self, names: Sequence[str], first: int) -> RotorTerm:
+        """The term of a model in which the induced velocity lags.
 
         Parameters
         ----------
-        name, column
-            Of that state, and where it stands in I.
+        names
+            Of its states: W and Z of `induction`.
+        first
+            Where the first stands in I.
         """
-        rate = Channel(f"{name}_rate", "m/s2")
-        about = replace(self.about, inputs=(*self.about.inputs, name), lags=True)
+        rates = tuple(Channel(f"{name}_rate", "m/s2") for name in names)
+        about = replace(self.about, inputs=(*self.about.inputs, *names), lags=len(names))
         return replace(
             self,
-            columns=(*self.columns, column),
-            channels=(*self.channels, rate),
+            columns=(*self.columns, *range(first, first + len(names))),
+            channels=(*self.channels, *rates),
             induction=jnp.asarray(make_induction(np.asarray(self.weights), self.grid)),
+            pace=from_host(np.zeros(1 + len(names))),
             about=about,
         )
 
@@ -331,7 +339,7 @@ class RotorTerm(Term):
 
     @property
     def parameters(self) -> tuple[jax.Array, ...]:
-        """What it learns: weights of corrections and latent states, factors, the lag's length."""
+        """What it learns: weights of corrections and latent states, factors, the lags."""
         late = (self.late,) if self.late.shape[1] > 1 else ()
         trim = (self.trim,) if self.about.uncertainty else ()
         pace = (self.pace,) if self.about.lags else ()
@@ -373,7 +381,7 @@ class RotorTerm(Term):
         structure: Mapping[str, Any],
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
-        told = {"memory": "speed", "uncertainty": 0.0, "lags": False, **structure["about"]}
+        told = {"memory": "speed", "uncertainty": 0.0, "lags": 0, **structure["about"]}
         # JSON turns tuples into lists, which are no keys of compiled functions.
         about: dict[str, Any] = {
             f.name: tuple(told[f.name]) if isinstance(told[f.name], list) else told[f.name]
