@@ -78,3 +78,123 @@ def test_blanks_and_apostrophes_between_thousands(tmp_path, between, decimal):
     ]
     notes = whole(put(tmp_path / "a.csv", ["Time;A;B", *rows]))
     assert any(f"thousands are set apart, as in 2{between}500" in note for note in notes)
+
+
+@pytest.mark.parametrize(("head", "sign"), [("A", "%"), ("A [%]", " %")])
+@pytest.mark.parametrize("decimal", [",", "."])
+def test_percent_signs_are_the_unit(tmp_path, head, sign, decimal):
+    rows = [f"{t};{a}{sign};{b}".replace(".", decimal) for t, a, b in zip(TIME, A, B, strict=True)]
+    path = put(tmp_path / "a.csv", [f"Time;{head};B", *rows])
+    whole(path)
+    assert read(path).channel("A").unit == "%"
+    # Where some cells have none, it is no unit of the column.
+    rows[7] = rows[7].replace(sign, "")
+    assert "is no number" in sentence(put(tmp_path / "b.csv", [f"Time;{head};B", *rows]))
+
+
+# -- rows ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("at", [0, 1, 2, 15, 41])
+@pytest.mark.parametrize("blanks", ["", "  ", '""'])
+def test_empty_rows_of_spreadsheets_are_nothing(tmp_path, separator, at, blanks):
+    lines = [line.replace(",", separator) for line in ("Time,A,B", *ROWS)]
+    empty = separator.join([blanks] * 3)
+    lines[at:at] = [empty, empty]
+    assert whole(put(tmp_path / "a.csv", lines)) == ()
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize(("head", "row"), [(0, 1), (0, 2), (1, 0), (3, 0), (1, 1)])
+def test_separators_at_the_ends_of_lines(tmp_path, separator, head, row):
+    lines = ["Time,A,B" + "," * head, "s,m,W" + "," * head]
+    lines += [line + "," * row for line in ROWS]
+    path = put(tmp_path / "a.csv", [line.replace(",", separator) for line in lines])
+    told = ("column 4 left out: it has no name and no values",)
+    assert whole(path) == (told if head and row else ())
+    assert [c.unit for c in read(path).channels] == ["m", "W"]
+
+
+def test_a_row_that_is_longer_than_others_is_refused(tmp_path):
+    for end in (",", ",7"):
+        rows = [*ROWS[:9], ROWS[9] + end, *ROWS[10:]]
+        assert "line 11: 4 values" in sentence(put(tmp_path / "a.csv", ["Time,A,B", *rows]))
+    rows = [f"{row},{i}" for i, row in enumerate(ROWS)]
+    path = put(tmp_path / "a.csv", ["Time,A,B", *rows])
+    assert "line 2: 4 values, but the header names 3" in sentence(path)
+
+
+@pytest.mark.parametrize("units", [[], ["s,m,W"]])
+@pytest.mark.parametrize("times", [1, 5])
+def test_a_header_that_is_repeated_is_passed_over(tmp_path, units, times):
+    head = ["Time,A,B", *units]
+    lines = [*head, *ROWS[:9]]
+    for k in range(times):
+        lines += [*head, *ROWS[9 + 5 * k : 14 + 5 * k]]
+    lines += ROWS[9 + 5 * times :]
+    (note,) = whole(put(tmp_path / "a.csv", lines))
+    assert note.endswith("the header: passed over")
+    first = len(head) + 10
+    plural = len(head) * times > 1
+    assert note.startswith(f"line{'s' * plural} {first}")
+
+
+# -- headers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("head", ["time, A, B", "time,A,B", "time;A;B", "time\tA\tB", "time A B"])
+@pytest.mark.parametrize("between", [" ", "   ", "\t", ",", ";"])
+@pytest.mark.parametrize("comment", ["# ", "", "%"])
+def test_names_and_rows_may_be_separated_in_different_ways(tmp_path, head, between, comment):
+    rows = [row.replace(",", between) for row in ROWS]
+    assert whole(put(tmp_path / "a.txt", [comment + head, *rows])) == ()
+
+
+def test_names_with_units_above_rows_between_blanks(tmp_path):
+    rows = ["  " + row.replace(",", "   ") for row in ROWS]
+    for head in ("# Time [s], A [kN m], B (W)", "Time [s]\tA [kN m]\tB (W)"):
+        path = put(tmp_path / "a.txt", ["# made by a test", head, *rows])
+        whole(path)
+        assert [c.unit for c in read(path).channels] == ["kN m", "W"]
+
+
+@pytest.mark.parametrize("comment", ["# s, t, kW", "# signals: t, A, B", "% t;A;B", "# t A B"])
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_a_comment_above_the_names_is_no_header(tmp_path, comment, separator):
+    lines = [line.replace(",", separator) for line in ("Time,A,B", *ROWS)]
+    assert whole(put(tmp_path / "a.csv", [comment, *lines])) == ()
+
+
+@pytest.mark.parametrize("unit", ["secs", "sec.", "Sec", "s.", "SECONDS"])
+@pytest.mark.parametrize("blank", [" ", "\u00a0", "\u202f"])
+@pytest.mark.parametrize("quote", ['"', ""])
+def test_spellings_of_the_header(tmp_path, unit, blank, quote):
+    cells = [f"{quote}{name}{quote}" for name in (f"Time{blank}[{unit}]", f"A{blank}[m]", "B")]
+    path = put(tmp_path / "a.csv", [", ".join(cells), *(row.replace(",", ", ") for row in ROWS)])
+    assert whole(path) == ()
+    assert read(path).channel("A").unit == "m"
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+@pytest.mark.parametrize("above", [[], ["# a comment without names"], ["# fs = 2 Hz"]])
+def test_a_table_without_names_is_refused(tmp_path, separator, above):
+    rows = [row.replace(",", separator) for row in ROWS]
+    path = put(tmp_path / "a.csv", [*above, *rows])
+    for step in (0.5, None):
+        assert "numbers stand where the names of the columns were" in sentence(path, step)
+    rows = [f"north{separator}{row}" for row in rows]
+    assert "numbers stand where" in sentence(put(tmp_path / "b.csv", [*above, *rows]), 0.5)
+
+
+def test_a_table_of_decimal_commas_without_names_is_refused(tmp_path):
+    rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
+    assert "numbers stand where" in sentence(put(tmp_path / "a.csv", rows), 0.5)
+
+
+def test_names_in_a_comment_right_above_numbers(tmp_path):
+    rows = [row.split(",", 1)[1] for row in ROWS]
+    run = read(put(tmp_path / "a.csv", ["# a test", "# A, B [W]", *rows]), 0.5)
+    assert run.names == ("A", "B")
+    np.testing.assert_array_equal(run.time, TIME)
+    np.testing.assert_array_equal(run["B"], B)
