@@ -275,3 +275,12 @@ def test_intervals_that_contradict_each_other_are_refused(tmp_path):
     assert "every 9 s" in sentence(saved(tmp_path, "mat", {"Ts": 9.0, "dt": 0.25, "x": WAVE}))
     same = ["# dt = 0.033, fs = 30", "x,y", *(f"{x},1" for x in WAVE)]
     assert read(put(tmp_path / "c.csv", same)).time[1] == pytest.approx(0.033)
+
+
+@pytest.mark.parametrize("unit", ["(min)", "(ms)", "[h]", "hr"])
+def test_openfast_s_text_with_a_time_in_another_unit_is_refused(tmp_path, unit):
+    rows = [f"{t:9.3f}\t{x:9.4f}" for t, x in zip(TIME, WAVE, strict=True)]
+    bare = unit.strip("()[]")
+    for header in ([f"Time\tWave1Elev\n{unit}\t(m)"], [f"Time [{bare}]\tWave1Elev [m]"]):
+        path = put(tmp_path / "a.out", ["a title", *header, *rows])
+        assert f"its time 'Time' is in '{bare}', expected s: convert it" in sentence(path)

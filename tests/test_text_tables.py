@@ -140,6 +140,15 @@ def test_a_header_that_is_repeated_is_passed_over(tmp_path, units, times):
     assert note.startswith(f"line{'s' * plural} {first}")
 
 
+def test_a_restarted_run_of_openfast_repeats_its_header(tmp_path):
+    rows = [row.replace(",", "\t") for row in ROWS]
+    head = ["Time\tA\tB", "(s)\t(kN m)\t(W)"]
+    path = put(tmp_path / "a.out", ["a title", *head, *rows[:20], *head, *rows[20:]])
+    assert whole(path) == ("lines 24, 25 repeat the header: passed over",)
+    path = put(tmp_path / "b.out", ["a title", *head, *rows[:20], *head, *rows[18:]])
+    assert "time goes back" in sentence(path)
+
+
 # -- headers ------------------------------------------------------------------------------------
 
 
@@ -174,6 +183,15 @@ def test_spellings_of_the_header(tmp_path, unit, blank, quote):
     path = put(tmp_path / "a.csv", [", ".join(cells), *(row.replace(",", ", ") for row in ROWS)])
     assert whole(path) == ()
     assert read(path).channel("A").unit == "m"
+
+
+def test_openfast_s_text_with_units_beside_the_names(tmp_path):
+    rows = [row.replace(",", "\t") for row in ROWS]
+    for head in ("Time (s)\tA (kN m)\tB (W)", "Time [s]  A [kN m]  B [W]", "Time_(s) A_(kN) B_(W)"):
+        path = put(tmp_path / "a.out", [head, *rows])
+        assert whole(path) == ()
+        assert read(path).channel("B").unit == "W"
+        assert read(path).channel("A").unit.startswith("kN")
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " "])
