@@ -71,11 +71,20 @@ def test_a_capital_t_alone_is_the_time_where_it_increases(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_capital_t_is_no_time_beside_a_rate(tmp_path, kind):
+def test_a_capital_t_is_no_time_beside_another_rate(tmp_path, kind):
     path = saved(tmp_path, kind, {"wave": WAVE, "T": WARM})
     run = read(path, 0.25)
     assert set(run.names) == {"wave", "T"}
     np.testing.assert_allclose(run.time, TIME)
+    run = read(saved(tmp_path, kind, {"wave": WAVE, "T": TIME + 20}), 0.25)
+    assert run.names == ("wave",)
+    np.testing.assert_allclose(run.time, TIME + 20)
+
+
+def test_the_same_time_twice_is_one(tmp_path):
+    run = read(saved(tmp_path, "csv", {"t": TIME, "x": WAVE, "T": TIME}))
+    assert run.names == ("x",)
+    assert run.notes == ("column 3 left out: the time once more",)
 
 
 @pytest.mark.parametrize(("header", "names"), [("T [kN],t", ("T",)), ("T [s],Time (s)", ("T",))])
@@ -98,6 +107,16 @@ def test_the_time_of_a_mat_file_is_as_long_as_its_signals(tmp_path):
     assert read(saved(tmp_path, "mat", results)).names == ("heave",)
     table = {"t": periods, "gain": periods**2, "time": TIME, "x": WAVE, "y": WAVE**2}
     assert read(saved(tmp_path, "mat", table)).names == ("x", "y")
+
+
+def test_other_names_of_a_time_beside_one_are_signals(tmp_path):
+    for elapsed in (TIME, TIME + 3):
+        run = read(saved(tmp_path, "mat", {"elapsed": elapsed, "time": TIME, "x": WAVE}))
+        assert run.names == ("elapsed", "x")
+    table = {"time": 12.5, "t": TIME[:7], "fs": 4.0, "x": WAVE}
+    run = read(saved(tmp_path, "mat", table))
+    assert run.names == ("x",)
+    assert sum("no real vector of 60 values" in note for note in run.notes) == 2
 
 
 # -- what numbers count -------------------------------------------------------------------------
@@ -284,3 +303,10 @@ def test_openfast_s_text_with_a_time_in_another_unit_is_refused(tmp_path, unit):
     for header in ([f"Time\tWave1Elev\n{unit}\t(m)"], [f"Time [{bare}]\tWave1Elev [m]"]):
         path = put(tmp_path / "a.out", ["a title", *header, *rows])
         assert f"its time 'Time' is in '{bare}', expected s: convert it" in sentence(path)
+
+
+def test_openfast_s_text_without_units_may_count_days_as_well(tmp_path):
+    rows = [f"{44927.5 + t / 86400:.9f} {x:9.4f}" for t, x in zip(TIME, WAVE, strict=True)]
+    run = read(put(tmp_path / "a.out", ["Time Wave1Elev", *rows]))
+    np.testing.assert_array_equal(run.time, TIME)
+    assert "numbers days as spreadsheets do" in run.notes[0]

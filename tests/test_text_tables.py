@@ -175,6 +175,12 @@ def test_a_comment_above_the_names_is_no_header(tmp_path, comment, separator):
     assert whole(put(tmp_path / "a.csv", [comment, *lines])) == ()
 
 
+@pytest.mark.parametrize("comment", ["# the time is", "# a t of", "% t, A"])
+def test_a_sentence_above_names_without_a_time_is_no_header(tmp_path, comment):
+    path = put(tmp_path / "a.csv", [comment, "x,y,z", *ROWS])
+    assert read(path, 0.5).names == ("x", "y", "z")
+
+
 @pytest.mark.parametrize("unit", ["secs", "sec.", "Sec", "s.", "SECONDS"])
 @pytest.mark.parametrize("blank", [" ", "\u00a0", "\u202f"])
 @pytest.mark.parametrize("quote", ['"', ""])

@@ -11,7 +11,7 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.core.units import factor, known
-from dfsm.data.readers.times import CAPITAL, SECONDS, time_rank
+from dfsm.data.readers.times import CAPITAL, SAME_STEP, SECONDS, time_rank
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 
@@ -22,8 +22,6 @@ INDEX = re.compile(r"|unnamed: \d+|__index_level_\d+__", re.IGNORECASE)
 # Sampling interval in s, or rate in Hz, of a record without a time.
 INTERVAL_NAMES = ("ts", "dt", "t_s", "step", "sampling_time", "sampling_interval")
 RATE_NAMES = ("fs", "f_s", "sampling_rate", "sampling_frequency", "samplerate", "sample_rate")
-# Share by which two intervals may differ that are one, written in few digits.
-_SAME_STEP = 0.02
 _PER_SECOND = ("samples/s", "samples/sec", "sample/s", "s/s", "sa/s", "sps")
 
 
@@ -200,10 +198,10 @@ def agreed_step(path: Path, told: Sequence[ToldStep]) -> tuple[ToldStep, str]:
         Two differ, and none or several are rates.
     """
     by_rate = [t for t in told if _one_word(t.name.rsplit(".", 1)[-1]) in RATE_NAMES]
-    others = [t for t in told if abs(t.step - told[0].step) > _SAME_STEP * told[0].step]
+    others = [t for t in told if abs(t.step - told[0].step) > SAME_STEP * told[0].step]
     if not others:
         return told[0], ""
-    apart = [t for t in by_rate if abs(t.step - by_rate[0].step) > _SAME_STEP * by_rate[0].step]
+    apart = [t for t in by_rate if abs(t.step - by_rate[0].step) > SAME_STEP * by_rate[0].step]
     if not by_rate or apart:
         raise DfsmError(
             f"{path}: samples are every {told[0].step:g} s by '{told[0].name}' and every "

@@ -83,7 +83,7 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
     rates = [] if step is None else [ToldStep(step, "", "was told")]
     if not rates:
         rates = _told_steps(lines[: header.at], channels, rows)
-    found = find_time(path, channels, rows, bool(rates))
+    found = find_time(path, channels, rows, [rate.step for rate in rates])
     rows, time = found.rows, found.at
     layout = Layout(
         path=path,

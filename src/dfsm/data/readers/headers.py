@@ -73,9 +73,11 @@ def find_header(path: Path, lines: list[str]) -> Header | None:
         if plain and i == plain[0][0]:
             return _with_rows(header, below, separators) or header
         found = _with_rows(header, below[:1], separators)
+        if found is None:
+            continue
         # What is told of a table, and a title, may hold a t, too: its names then stand below.
-        doubtful = is_comment(line) or (found and found.separator != header.separator)
-        if found and not (doubtful and _is_header(below[0], separators)):
+        sure = _begins_record(below[0]) or found.separator == header.separator
+        if sure and not (is_comment(line) and _is_header(below[0], separators)):
             return _with_rows(header, below, separators) or found
     if not plain:
         return None
@@ -138,11 +140,11 @@ def _begins_record(line: str) -> bool:
 
 
 def _is_header(line: str, separators: str) -> bool:
-    """Whether a line below a comment holds names: one of a time, or no number and no unit."""
+    """Whether a line below a comment holds names: one of a time, or neither numbers nor units."""
     names = _header(0, line, separators).names
-    if _names_time(names):
-        return True
-    return not any(number(n) is not None or tells_time(n) or listed(n.strip("()[]")) for n in names)
+    if _names_time(names) or any(map(_is_value, names)):
+        return _names_time(names)
+    return 2 * sum(listed(name.strip("()[]")) for name in names) < len(names)
 
 
 def _named_above(path: Path, lines: list[str], header: Header, separators: str) -> Header:

@@ -143,9 +143,12 @@ def without_more_times(
     """
     keep, notes = kept
     name, rank = channels[time].name.lower(), time_rank(channels[time].name)
-    # A T beside a t is no time.
+    again = [j for j in keep if channels[j].name.lower() == name]
+    # A T beside a t that holds something else is no time.
     again = [
-        j for j in keep if channels[j].name.lower() == name and time_rank(channels[j].name) == rank
+        j
+        for j in again
+        if time_rank(channels[j].name) == rank or np.array_equal(columns[j], columns[time])
     ]
     for j in again:
         there = np.isfinite(columns[j])

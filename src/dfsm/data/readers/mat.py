@@ -30,6 +30,8 @@ from dfsm.data.readers.mat4 import is_mat4, read_mat4
 from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
 from dfsm.data.readers.times import (
     CAPITAL,
+    OTHER_NAMED,
+    SMALL,
     capital_note,
     counts_from_a_date,
     rises,
@@ -114,7 +116,7 @@ def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) 
         n: v for n, v in found.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiub"
     }
     rates = _told_steps(numbers, step)
-    time_name = _time_name(numbers, bool(rates))
+    time_name = _time_name(numbers, [rate.step for rate in rates])
     notes: list[str] = []
     told = ""
     if time_name is None:
@@ -124,20 +126,22 @@ def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) 
         raw, called = np.ravel(numbers[time_name]).astype(np.float64), _last(time_name)
         time, note = seconds_of(called, "", raw)
         notes = [n for n in (note, capital_note(called, "")) if n]
+    chosen = None if time_name is None else _rank(time_name)
     columns: list[Array] = []
     channels: list[Channel] = []
     for name, value in found.items():
         if name in (time_name, told):
             continue
-        rank = _rank(name)
-        if rank is not None and name in numbers:
-            if _same_times(numbers[name], raw):
-                continue
-            if rank != CAPITAL or (time_name and _rank(time_name) == CAPITAL):
-                notes.append(f"'{name}' left out: it is another time than '{time_name}'")
-                continue
+        rank = _rank(name) if name in numbers else None
+        # What is called elapsed or the like beside a time is a signal; so is a T that differs.
+        same = rank is not None and _same_times(numbers[name], raw)
+        if same and (rank != OTHER_NAMED or rank == chosen):
+            continue
+        if chosen is not None and rank is not None and rank <= max(chosen, SMALL):
+            notes.append(f"'{name}' left out: it is another time than '{time_name}'")
+            continue
         table = _along(numbers.get(name), len(time))
-        other = None if time_name is None else _own_time(name, numbers, _rank(time_name))
+        other = None if chosen is None else _own_time(name, numbers, max(chosen, SMALL))
         if table is None or (other is not None and not _same_times(numbers[other], raw)):
             notes.append(f"'{name}' left out: {_why(value, len(time), other)}")
             continue
@@ -176,11 +180,11 @@ def _rank(name: str) -> int | None:
     return time_rank(last)
 
 
-def _time_name(numbers: Mapping[str, np.ndarray], rated: bool) -> str | None:
+def _time_name(numbers: Mapping[str, np.ndarray], steps: Sequence[float]) -> str | None:
     """The time: one that signals are as long as, that lies least deep, in the first struct.
 
     Of several there the longest, of these by its name. What counts from a date comes behind them,
-    a T last: where no rate is told, and it increases.
+    a T last: where it increases, by the steps that are told if any are.
     """
     vectors = {n: v for n, v in numbers.items() if v.size > 1 and v.size == max(v.shape)}
     named = {n: rank for n in vectors if (rank := _rank(n)) is not None}
@@ -188,7 +192,7 @@ def _time_name(numbers: Mapping[str, np.ndarray], rated: bool) -> str | None:
     usable = {
         n: any(_along(s, vectors[n].size) is not None for s in signals if s is not vectors[n])
         for n, rank in named.items()
-        if rank != CAPITAL or (not rated and rises(np.ravel(vectors[n]).astype(np.float64)))
+        if rank != CAPITAL or rises(np.ravel(vectors[n]).astype(np.float64), steps)
     }
     folders = list(dict.fromkeys(n.rpartition(".")[0] for n in usable))
 
@@ -198,7 +202,7 @@ def _time_name(numbers: Mapping[str, np.ndarray], rated: bool) -> str | None:
         return rank == CAPITAL, not usable[name], name.count("."), folder, -size, rank
 
     best = min(usable, key=place, default=None)
-    if best is not None and not usable[best] and rated:
+    if best is not None and not usable[best] and steps:
         best = None
     if best is None or named[best] == CAPITAL:
         dated = (n for n, v in vectors.items() if counts_from_a_date(_last(n), np.ravel(v)))
@@ -206,17 +210,17 @@ def _time_name(numbers: Mapping[str, np.ndarray], rated: bool) -> str | None:
     return best
 
 
-def _own_time(name: str, numbers: Mapping[str, np.ndarray], rank: int | None) -> str | None:
+def _own_time(name: str, numbers: Mapping[str, np.ndarray], lowest: int) -> str | None:
     """The time in the same struct as a variable, or in the nearest around it.
 
-    A T is one where the time of the run, of this rank, is one.
+    One whose name comes after this rank is a signal.
     """
     folder = name
     while "." in folder:
         folder = folder.rsplit(".", 1)[0]
         for other in numbers:
-            own = _rank(other) if other.rpartition(".")[0] == folder else None
-            if own is not None and (own != CAPITAL or rank == CAPITAL):
+            rank = _rank(other) if other.rpartition(".")[0] == folder else None
+            if rank is not None and rank <= lowest:
                 return other
     return None
 
@@ -252,7 +256,9 @@ def _without_time(
         )
     if not rates:
         raise no_time(path, [Channel(f"{n} ({_what(v)})") for n, v in found.items()])
-    lengths = [max(v.shape) for v in numbers.values() if v.size > 1]
+    lengths = [
+        max(v.shape) for n, v in numbers.items() if v.size > 1 and _rank(n) in (None, CAPITAL)
+    ]
     if not lengths:
         raise DfsmError(f"{path}: no signal, expected vectors of one length beside the rate")
     # Signals of one record have one length; the one that most of them have.

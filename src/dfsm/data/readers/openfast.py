@@ -27,6 +27,7 @@ from dfsm.data.readers.columns import check_seconds, split_header
 from dfsm.data.readers.headers import NAME_AND_UNIT, without_repeats
 from dfsm.data.readers.long_run import LONG, LongRun, long_run
 from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
+from dfsm.data.readers.times import seconds_of
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -327,6 +328,9 @@ def _read_text(path: Path) -> Trajectory:
         notes.append(f"'{names[j]}' holds words ('{rows[0].cells[j][:24]}'): its samples are NaN")
     if table.stamps is not None:
         notes.append(table.stamps.note(names[0]))
+    else:
+        time, counted = seconds_of(names[0], units[0], time)
+        notes += [counted] if counted else []
     if path.suffix.lower().startswith(ROSCO_LOG) and len(time) > 1 and time[0] == time[1]:
         # ROSCO is called once before the simulation starts, and logs that call, too.
         time, values = time[1:], values[1:]

@@ -83,9 +83,9 @@ def time_index(
         stamped = is_stamped(schema.field(i)) or counts_from_a_date(channel.name, columns[i])
         if stamped and is_date_name(channel.name) and not channel.unit:
             return i
-    if step is not None:
-        return None
-    return time_column(path, channels, lambda i: rises(columns[i]))
+    if step is None:
+        return time_column(path, channels, lambda i: rises(columns[i]))
+    return None if wrong else named_time(path, channels, lambda i: rises(columns[i], [step]))
 
 
 def is_stamped(field: pa.Field) -> bool:

@@ -34,7 +34,9 @@ class TimeColumn:
     date: int | None = None
 
 
-def find_time(path: Path, channels: Sequence[Channel], rows: list[Row], rated: bool) -> TimeColumn:
+def find_time(
+    path: Path, channels: Sequence[Channel], rows: list[Row], steps: Sequence[float]
+) -> TimeColumn:
     """The column of the time: of stamps or durations, of numbers by its name, of dates.
 
     Parameters
@@ -45,8 +47,8 @@ def find_time(path: Path, channels: Sequence[Channel], rows: list[Row], rated: b
         What the header says.
     rows
         Of cells with decimal points.
-    rated
-        Whether the interval between samples is told: a T without a unit is then no time.
+    steps
+        Intervals between samples in s that are told: a T that does not agree is no time.
 
     Raises
     ------
@@ -77,8 +79,8 @@ def find_time(path: Path, channels: Sequence[Channel], rows: list[Row], rated: b
         if i in told and INDEX.fullmatch(channel.name):
             return TimeColumn(i, rows)
     if ranks:
-        rising = None if rated else lambda i: rises(_numbers(rows, i))
-        return TimeColumn(named_time(path, channels, rising), rows)
+        at = named_time(path, channels, lambda i: rises(_numbers(rows, i), steps))
+        return TimeColumn(at, rows)
     return TimeColumn(None, rows)
 
 

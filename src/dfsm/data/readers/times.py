@@ -8,6 +8,7 @@ milliseconds and finer; in seconds where its name says so), or number days, as s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from dfsm.core.types import Array
 
 # How a time is called, first those that come first: a capital T is a temperature, a thrust, a
 # tension or a period as often, so that it is the last.
-_TIME, _SMALL, _OTHER, CAPITAL = range(4)
+_TIME, SMALL, OTHER_NAMED, CAPITAL = range(4)
 _OTHER_NAMES = (
     *("time_s", "time_sec", "elapsed time", "elapsed_time", "elapsed", "zeit", "temps", "tiempo"),
     *("tempo", "tijd", "tid"),
@@ -28,6 +29,8 @@ _DATES = (
     "datenum",
 )
 SECONDS = ("", "s", "s.", "sec", "sec.", "secs", "secs.", "second", "seconds")
+# Share by which two intervals may differ that are one, written in few digits.
+SAME_STEP = 0.02
 # Numbers of time since 1970 in 2001 and in 2100, in s, and what times them there may count.
 _SINCE_1970, _COUNTS = (1e9, 4.1e9), {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # Numbers of the days of 2000 to 2050.
@@ -49,10 +52,10 @@ def time_rank(name: str) -> int | None:
     if called == "T":
         return CAPITAL
     if called == "t":
-        return _SMALL
+        return SMALL
     if called.lower() == "time":
         return _TIME
-    return _OTHER if called.lower() in _OTHER_NAMES else None
+    return OTHER_NAMED if called.lower() in _OTHER_NAMES else None
 
 
 def is_date_name(name: str) -> bool:
@@ -60,9 +63,20 @@ def is_date_name(name: str) -> bool:
     return name.strip().lower() in _DATES
 
 
-def rises(values: Array) -> bool:
-    """Whether samples are finite and increase, as those of a time do."""
-    return len(values) > 1 and bool(np.isfinite(values).all() and (np.diff(values) > 0).all())
+def rises(values: Array, steps: Sequence[float] = ()) -> bool:
+    """Whether samples are finite and increase, as those of a time do.
+
+    Parameters
+    ----------
+    values
+        Shape ``(time,)``.
+    steps
+        Intervals between samples in s that are told otherwise: a time agrees with one of them.
+    """
+    if len(values) < 2 or not np.isfinite(values).all() or not (np.diff(values) > 0).all():
+        return False
+    step = float((values[-1] - values[0]) / (len(values) - 1))
+    return not steps or any(abs(step - told) <= SAME_STEP * told for told in steps)
 
 
 def capital_note(name: str, unit: str) -> str:
