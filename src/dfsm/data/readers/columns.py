@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.core.units import factor, known
+from dfsm.data.readers.times import CAPITAL, SAME_STEP, SECONDS, time_rank
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 
 # The name, one separator at most, and the unit in brackets at the end.
 HEADER = re.compile(r"(.+?)[_ ]?(?:\[([^\[\]]*)\]|\(([^()]*)\))")
-TIME_NAMES = ("time", "t")
-# Names that count where no column has one of these: other spellings, and other languages.
-ALSO_TIME = (
-    *("time_s", "time_sec", "elapsed time", "elapsed_time", "elapsed", "zeit", "temps", "tiempo"),
-    *("tempo", "tijd", "tid"),
-)
 # What pandas calls a column that it saved or read without a name, and a name left blank.
 INDEX = re.compile(r"|unnamed: \d+|__index_level_\d+__", re.IGNORECASE)
-SECONDS = ("", "s", "sec", "second", "seconds")
 # Sampling interval in s, or rate in Hz, of a record without a time.
 INTERVAL_NAMES = ("ts", "dt", "t_s", "step", "sampling_time", "sampling_interval")
 RATE_NAMES = ("fs", "f_s", "sampling_rate", "sampling_frequency", "samplerate", "sample_rate")
 _PER_SECOND = ("samples/s", "samples/sec", "sample/s", "s/s", "sa/s", "sps")
-# Numbers of time since 1970 in 2001 and in 2100, in s, and what times them there may count.
-_SINCE_1970, _COUNTS = (1e9, 4.1e9), {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
 
 def split_header(text: str) -> tuple[str, str]:
@@ -89,23 +82,64 @@ def _numbers_rows(values: Array) -> bool:
     return bool(whole and (np.diff(values) > 0).all())
 
 
-def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TIME_NAMES) -> int:
-    """Return the column that holds the time.
+def named_time(
+    path: Path, channels: Sequence[Channel], rising: Callable[[int], bool] | None = None
+) -> int | None:
+    """Return the column that is called a time; None where there is none.
+
+    A capital T is one where nothing else is, its unit is s, or it has none, and it increases.
+
+    Parameters
+    ----------
+    path
+        The file, for messages.
+    channels
+        Header of every column.
+    rising
+        Whether the samples of a column increase; without it a T needs the unit.
+
+    Raises
+    ------
+    DfsmError
+        Its unit is not s.
+    """
+    ranks = {i: rank for i, c in enumerate(channels) if (rank := time_rank(c.name)) is not None}
+    for at in sorted(ranks, key=lambda i: ranks[i]):
+        unit = channels[at].unit
+        if ranks[at] == CAPITAL:
+            other = known(unit) and factor(unit, "s") is None
+            if other or (not unit and rising is None) or (rising is not None and not rising(at)):
+                continue
+        check_seconds(path, channels[at].name, unit)
+        return at
+    return None
+
+
+def check_seconds(path: Path, name: str, unit: str) -> None:
+    """Refuse a time in another unit than s.
+
+    Raises
+    ------
+    DfsmError
+        It is.
+    """
+    if unit.lower() not in SECONDS:
+        raise DfsmError(f"{path}: its time '{name}' is in '{unit}', expected s: convert it")
+
+
+def time_column(
+    path: Path, channels: Sequence[Channel], rising: Callable[[int], bool] | None = None
+) -> int:
+    """Return the column that holds the time, see `named_time`.
 
     Raises
     ------
     DfsmError
         There is none, or its unit is not s.
     """
-    called = [channel.name.lower() for channel in channels]
-    at = next((i for kind in (names, ALSO_TIME) for i, n in enumerate(called) if n in kind), None)
+    at = named_time(path, channels, rising)
     if at is None:
         raise no_time(path, channels)
-    if channels[at].unit.lower() not in SECONDS:
-        raise DfsmError(
-            f"{path}: its time '{channels[at].name}' is in '{channels[at].unit}', expected s: "
-            "convert it"
-        )
     return at
 
 
@@ -132,7 +166,7 @@ def rate_step(name: str, value: float, unit: str = "") -> float | None:
     unit
         What stands beside it; a unit of something else makes it another number.
     """
-    called = "_".join(name.lower().split())
+    called = _one_word(name)
     rate = called in RATE_NAMES
     if not (np.isfinite(value) and value > 0) or not (rate or called in INTERVAL_NAMES):
         return None
@@ -143,28 +177,45 @@ def rate_step(name: str, value: float, unit: str = "") -> float | None:
     return 1 / (value * scale) if rate else value * scale
 
 
-def since_1970(time: Array, *, seconds: bool) -> tuple[Array, str] | None:
-    """Seconds since the first of times that count from 1970, and what they count.
+@dataclass(frozen=True)
+class ToldStep:
+    """An interval between samples in s that a file tells, the name it has there, and where."""
 
-    Parameters
-    ----------
-    time
-        As they stand in a file that names no unit, shape ``(time,)``.
-    seconds
-        Whether times in seconds are looked for as well: by themselves they are right as they are.
+    step: float
+    name: str
+    source: str
 
-    Returns
-    -------
-    tuple or None
-        None where their size is that of other times.
+
+def agreed_step(path: Path, told: Sequence[ToldStep]) -> tuple[ToldStep, str]:
+    """The interval between samples that a file tells, and a note on others that it seems to tell.
+
+    ``Ts`` and the like are other quantities as well, the period of waves for one, so that a rate
+    counts where both are told and differ.
+
+    Raises
+    ------
+    DfsmError
+        Two differ, and none or several are rates.
     """
-    low, high = _SINCE_1970
-    if not len(time) or not np.isfinite(time).all():
-        return None
-    for word, count in (({"seconds": 1.0} if seconds else {}) | _COUNTS).items():
-        if low * count <= time.min() and time.max() < high * count:
-            return (time - time[0]) / count, word
-    return None
+    by_rate = [t for t in told if _one_word(t.name.rsplit(".", 1)[-1]) in RATE_NAMES]
+    others = [t for t in told if abs(t.step - told[0].step) > SAME_STEP * told[0].step]
+    if not others:
+        return told[0], ""
+    apart = [t for t in by_rate if abs(t.step - by_rate[0].step) > SAME_STEP * by_rate[0].step]
+    if not by_rate or apart:
+        raise DfsmError(
+            f"{path}: samples are every {told[0].step:g} s by '{told[0].name}' and every "
+            f"{others[0].step:g} s by '{others[0].name}': remove the one that is none, or tell the "
+            "interval (--step of the command, data.step in a configuration)"
+        )
+    names = dict.fromkeys(t.name for t in told if t not in by_rate)
+    which = " and ".join(f"'{name}'" for name in names)
+    tell = "tells" if len(names) == 1 else "tell"
+    return by_rate[0], f"{which} beside '{by_rate[0].name}' {tell} no interval between samples"
+
+
+def _one_word(name: str) -> str:
+    return "_".join(name.lower().split())
 
 
 def uniform_times(path: Path, count: int, step: float) -> Array:

@@ -9,9 +9,8 @@ Numbers may have decimal commas, see `dfsm.data.readers.decimals`.
 
 from __future__ import annotations
 
-import csv
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +18,25 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
-    ALSO_TIME,
-    TIME_NAMES,
+    ToldStep,
+    agreed_step,
     kept_columns,
     no_time,
     rate_step,
-    since_1970,
-    time_column,
     uniform_times,
 )
-from dfsm.data.readers.decimals import with_points
+from dfsm.data.readers.decimals import with_points, without_percent
 from dfsm.data.readers.guard import unguarded
+from dfsm.data.readers.headers import (
+    BLANKS,
+    RATE,
+    find_header,
+    is_comment,
+    rate_of,
+    rows_below,
+    without_empty_ends,
+    without_repeats,
+)
 from dfsm.data.readers.labels import (
     count_labels,
     label_rows,
@@ -37,33 +44,11 @@ from dfsm.data.readers.labels import (
     without_more_times,
 )
 from dfsm.data.readers.lvm import TITLE, read_lvm
-from dfsm.data.readers.stamps import is_stamp
-from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
+from dfsm.data.readers.text import Layout, Row, decode, number, read_rows
+from dfsm.data.readers.text_times import find_time
+from dfsm.data.readers.times import capital_note, seconds_of
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
-
-_COMMENTS = ("#", "%", "!")
-_HEADER_LINES = 200
-_BLANKS = ""  # the separator of columns that blanks separate
-_STAMP_NAMES = (
-    *("timestamp", "datetime", "date", "date time", "date_time", "date/time", "datum"),
-    "zeitstempel",
-)
-_NAME_AND_UNIT = re.compile(r"\S+?[ _]?(?:\([^()]*\)|\[[^\[\]]*\])|\S+")
-_RATE = re.compile(
-    r"((?:[^\W\d]\w*[ _])?[^\W\d]\w*)\s*[=:,;\t]\s*([-+]?[.\d][.\deE+-]*) *([^\s,;]*)"
-)
-# What spreadsheets write above a table to say how its cells are separated.
-_SEPARATED = re.compile(r"sep=(.)", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class _Header:
-    """Where the names stand, how cells are separated, and what they are."""
-
-    at: int
-    separator: str
-    names: list[str]
 
 
 def read_delimited(path: Path, step: float | None = None) -> Trajectory:
@@ -78,17 +63,28 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
     if text.startswith(TITLE):
         return read_lvm(path, text)
     lines = text.split("\n")
-    header = _find_header(lines)
+    header = find_header(path, lines)
     if header is None:
         raise DfsmError(f"{path} holds blank lines only: check that it is the right file")
-    rows, commas = with_points(path, _rows(path, lines, header), header.separator)
-    channels = named_channels([unguarded(cell) for cell in header.names])
+    names, rows = without_empty_ends(header.names, rows_below(path, lines, header))
+    channels = named_channels([unguarded(cell) for cell in names])
+    rows, percent = without_percent(rows, channels)
+    rows, commas = with_points(path, rows, header.separator)
     labels = rows[: count_labels(rows)]
-    units, words = label_rows(labels, lines, header.at, channels, header.separator == _BLANKS)
+    units, words = label_rows(labels, lines, header.at, channels, header.separator == BLANKS)
     if units:
         channels = [Channel(c.name, c.unit or u) for c, u in zip(channels, units, strict=True)]
         rows = rows[len(labels) :]
-    time = _time(path, channels, rows)
+    heads = [row.cells for row in labels] if units else []
+    rows, repeats = without_repeats(rows, names, heads)
+    channels = [
+        Channel(c.name, c.unit or "%") if j in percent else c for j, c in enumerate(channels)
+    ]
+    rates = [] if step is None else [ToldStep(step, "", "was told")]
+    if not rates:
+        rates = _told_steps(lines[: header.at], channels, rows)
+    found = find_time(path, channels, rows, [rate.step for rate in rates])
+    rows, time = found.rows, found.at
     layout = Layout(
         path=path,
         names=[c.name for c in channels],
@@ -101,160 +97,67 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
     table = read_rows(rows, layout)
     columns = list(table.values.T)
     channels = [Channel(c.name, c.unit, s) for c, s in zip(channels, table.steps, strict=True)]
+    notes: list[str] = []
     if time is None:
-        told, rate, note = _uniform(path, lines[: header.at], channels, columns, step)
+        told, rate, notes = _uniform(path, channels, rates, len(table.values))
+    elif table.stamps is not None:
+        told, rate = columns[time], time
+        stamped = [time] if found.date is None else [found.date, time]
+        notes = [table.stamps.note(*(channels[j].name for j in stamped))]
     else:
-        told, rate, note = columns[time], time, ""
-        if counted := _counted(channels[time], told) if table.stamps is None else None:
-            told, what = counted
-            name = channels[time].name
-            note = f"'{name}' counts {what} since 1970: times are seconds since the first"
-    keep, notes = kept_columns(path, channels, columns, rate)
+        rate, channel = time, channels[time]
+        told, note = seconds_of(channel.name, channel.unit, columns[time])
+        notes = [note, capital_note(channel.name, channel.unit)]
+    keep, left_out = kept_columns(path, channels, columns, rate)
     if time is not None:
-        keep, notes = without_more_times(path, channels, columns, time, (keep, notes))
+        keep, left_out = without_more_times(path, channels, columns, time, (keep, left_out))
+    keep = [j for j in keep if j != found.date]
     for j in table.words:
         if j in keep and rows:
             keep.remove(j)
             example = rows[0].cells[j].strip()[:24]
-            notes.append(f"column '{channels[j].name}' left out: it holds words ('{example}')")
-    if table.stamps is not None and time is not None:
-        note = table.stamps.note(channels[time].name)
-    notes += [text for text in (note, commas, words) if text]
+            left_out.append(f"column '{channels[j].name}' left out: it holds words ('{example}')")
+    notes = [note for note in (*left_out, *notes, commas, words, repeats) if note]
     values = np.stack([columns[i] for i in keep], axis=1) if keep else np.empty((len(told), 0))
     return assemble(path, told, values, [channels[i] for i in keep], notes=(*table.notes, *notes))
 
 
-# -- header -------------------------------------------------------------------------------------
+# -- rate ---------------------------------------------------------------------------------------
 
 
-def _find_header(lines: list[str]) -> _Header | None:
-    """The line of the names: the first that names a time, else the first that is no comment."""
-    seen = [(i, line) for i, line in enumerate(lines[: 5 * _HEADER_LINES]) if line.strip()]
-    told = _SEPARATED.fullmatch(seen[0][1].strip(' \t\r"')) if seen else None
-    if told:
-        seen = seen[1:]
-    separators = told[1] if told else ",;\t"
-    plain = [(i, line) for i, line in seen[:_HEADER_LINES] if not _is_comment(line)]
-    while len(plain) > 1 and _tells_rate(plain[0][1]):
-        del plain[0]
-    for i, line in seen[:_HEADER_LINES]:
-        comment = _is_comment(line)
-        names = line.lstrip(" " + "".join(_COMMENTS)) if comment else line
-        header = _header(i, names, separators)
-        # "Time" beside a time of day is what is told of a measurement, no name of a column.
-        if not _names_time(header.names) or any(map(is_stamp, header.names)):
+def _told_steps(
+    above: Sequence[str], channels: Sequence[Channel], rows: Sequence[Row]
+) -> list[ToldStep]:
+    """Intervals between samples that columns of one number, comments or lines above tell."""
+    told: list[ToldStep] = []
+    for j, channel in enumerate(channels):
+        if rate_step(channel.name, 1.0, channel.unit) is None:
             continue
-        first = plain and i == plain[0][0] and not comment
-        below = next((text for j, text in plain if j > i), None)
-        # A sentence may hold the word as well, but no row of as many cells stands below it.
-        if first or (below and len(_cells(below, header.separator)) == len(header.names)):
-            return header
-    return _header(*plain[0], separators) if plain else None
-
-
-def _header(at: int, line: str, separators: str) -> _Header:
-    separator = max(separators, key=line.count)
-    if separator in line:
-        return _Header(at, separator, _cells(line, separator))
-    return _Header(at, _BLANKS, _NAME_AND_UNIT.findall(line))
-
-
-def _tells_rate(line: str) -> bool:
-    match = _RATE.fullmatch(line.strip(" ,;\t"))
-    return match is not None and _rate_of(match) is not None
-
-
-def _rate_of(match: re.Match[str]) -> float | None:
-    """Interval in s that ``fs = 50 Hz`` and the like tell; None for other words and numbers."""
-    words, value = match[1].split(" "), number(match[2]) or 0.0
-    return rate_step(match[1], value, match[3]) or rate_step(words[-1], value, match[3])
-
-
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(_COMMENTS)
-
-
-def _names_time(names: list[str]) -> bool:
-    known = (*TIME_NAMES, *ALSO_TIME, *_STAMP_NAMES)
-    return any(c.name.lower() in known for c in named_channels(names))
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    if separator == _BLANKS:
-        return blank_cells(line)
-    return next(csv.reader([line], delimiter=separator), [])
-
-
-def _rows(path: Path, lines: list[str], header: _Header) -> list[Row]:
-    """All rows below the header, without blank lines and comments."""
-    numbered = [
-        (i + 1, line)
-        for i, line in enumerate(lines)
-        if i > header.at and line.strip() and not _is_comment(line)
-    ]
-    if header.separator == _BLANKS:
-        return [Row(n, blank_cells(line)) for n, line in numbered]
-    # A quoted cell may go over several lines.
-    reader = csv.reader((line for _, line in numbered), delimiter=header.separator)
-    try:
-        return [Row(numbered[reader.line_num - 1][0], cells) for cells in reader]
-    except csv.Error as error:
-        line = numbered[min(reader.line_num, len(numbered)) - 1][0]
-        raise DfsmError(f"{path}, line {line}: {error}; it is no CSV table") from None
-
-
-# -- time ---------------------------------------------------------------------------------------
-
-
-def _time(path: Path, channels: list[Channel], rows: list[Row]) -> int | None:
-    """The column of the time or of time stamps; None where there is neither."""
-    first = rows[0].cells if rows else []
-    for names in (TIME_NAMES, ALSO_TIME, _STAMP_NAMES):
-        for i, channel in enumerate(channels):
-            if channel.name.lower() in names and i < len(first) and is_stamp(first[i]):
-                return i
-    if any(c.name.lower() in (*TIME_NAMES, *ALSO_TIME) for c in channels):
-        return time_column(path, channels)
-    for i, channel in enumerate(channels):
-        if channel.name.lower() in _STAMP_NAMES and i < len(first):
-            counts = np.array([np.nan if (value := number(first[i])) is None else value])
-            if since_1970(counts, seconds=True):
-                return i
-    return None
-
-
-def _counted(channel: Channel, time: Array) -> tuple[Array, str] | None:
-    """Times that count from 1970 in a column whose unit nobody states."""
-    return None if channel.unit else since_1970(time, seconds=channel.name.lower() in _STAMP_NAMES)
+        found = [number(row.cells[j]) for row in rows if len(row.cells) == len(channels)]
+        finite = {value for value in found if value is not None and np.isfinite(value)}
+        step = rate_step(channel.name, finite.pop(), channel.unit) if len(finite) == 1 else None
+        if step is not None:
+            told.append(ToldStep(step, channel.name, f"stands in column '{channel.name}'"))
+    for line in above:
+        source = "stands in a comment" if is_comment(line) else "stands above the table"
+        for match in RATE.finditer(line):
+            if rate := rate_of(match):
+                told.append(ToldStep(*rate, source))
+    return told
 
 
 def _uniform(
-    path: Path,
-    above: list[str],
-    channels: list[Channel],
-    columns: list[Array],
-    step: float | None,
-) -> tuple[Array, int | None, str]:
-    """Times of a record without any, the column that holds its rate, and what to tell.
-
-    The rate is told, or stands in a column or in a comment.
-    """
-    at, source = None, "was told"
-    for j, values in enumerate(columns) if step is None else ():
-        finite = values[np.isfinite(values)]
-        if len(finite) and finite.min() == finite.max():
-            step = rate_step(channels[j].name, float(finite[0]), channels[j].unit)
-            if step is not None:
-                at, source = j, f"stands in column '{channels[j].name}'"
-                break
-    for line in above if step is None else ():
-        for match in _RATE.finditer(line):
-            step = _rate_of(match) if step is None else step
-            source = "stands in a comment" if _is_comment(line) else "stands above the table"
-    if step is None:
+    path: Path, channels: Sequence[Channel], rates: Sequence[ToldStep], count: int
+) -> tuple[Array, int | None, list[str]]:
+    """Times of a record without any, the column that holds its rate, and what to tell."""
+    if not rates:
         raise no_time(path, channels)
-    note = f"there is no time column: samples every {step:g} s, which {source}"
-    return uniform_times(path, len(columns[0]), step), at, note
+    rate, others = agreed_step(path, rates)
+    at = next(
+        (j for j, c in enumerate(channels) if rate.source == f"stands in column '{c.name}'"), None
+    )
+    note = f"there is no time column: samples every {rate.step:g} s, which {rate.source}"
+    return uniform_times(path, count, rate.step), at, [note, others]
 
 
 # -- what to do ---------------------------------------------------------------------------------

@@ -14,9 +14,10 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.core.units import listed
-from dfsm.data.readers.columns import ALSO_TIME, SECONDS, TIME_NAMES, split_header
+from dfsm.data.readers.columns import split_header
 from dfsm.data.readers.stamps import is_stamp
 from dfsm.data.readers.text import Row, number
+from dfsm.data.readers.times import SECONDS, time_rank
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 
@@ -27,10 +28,13 @@ _BRACKETED = re.compile(r"\s*(\(.*\)|\[.*\])\s*")
 # How a file of Campbell's loggers begins, and what stands there for the units of stamps and counts.
 _TOA5, _NO_UNITS = re.compile(r'"?TOA5"?,'), ("TS", "RN")
 _MOST = 60
+# Blanks of other widths, and the one that breaks no line.
+_SPACES = re.compile(r"[\u00a0\u2000-\u200a\u202f\u3000]")
 
 
 def named_channels(cells: Sequence[str]) -> list[Channel]:
     """Channels by the cells of a header, ``Name [unit]``; ``Name(1)``, ``Name(2)`` are no units."""
+    cells = [_SPACES.sub(" ", cell) for cell in cells]
     channels = [Channel(*split_header(cell)) for cell in cells]
     names = [c.name for c in channels]
     return [
@@ -101,7 +105,7 @@ def _are_units(cells: Sequence[str], channels: Sequence[Channel]) -> bool:
     """Texts in brackets, or the time's unit in its place, or units that are known."""
     if any(_BRACKETED.fullmatch(cell) for cell in cells):
         return True
-    times = [c.name.lower() in (*TIME_NAMES, *ALSO_TIME) for c in channels]
+    times = [time_rank(c.name) is not None for c in channels]
     if any(t and u.strip().lower() in SECONDS[1:] for t, u in zip(times, cells, strict=True)):
         return True
     texts = [cell for cell in cells if cell.strip()]
@@ -138,8 +142,14 @@ def without_more_times(
         Another time differs: the channels beside it were sampled at that one.
     """
     keep, notes = kept
-    name = channels[time].name.lower()
+    name, rank = channels[time].name.lower(), time_rank(channels[time].name)
     again = [j for j in keep if channels[j].name.lower() == name]
+    # A T beside a t that holds something else is no time.
+    again = [
+        j
+        for j in again
+        if time_rank(channels[j].name) == rank or np.array_equal(columns[j], columns[time])
+    ]
     for j in again:
         there = np.isfinite(columns[j])
         if not np.array_equal(columns[j][there], columns[time][there]):

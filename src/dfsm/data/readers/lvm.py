@@ -18,10 +18,11 @@ import numpy as np
 
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
-from dfsm.data.readers.columns import SECONDS, uniform_times
+from dfsm.data.readers.columns import uniform_times
 from dfsm.data.readers.decimals import with_points
 from dfsm.data.readers.stamps import read_stamps
 from dfsm.data.readers.text import Layout, Row, Table, number, read_rows
+from dfsm.data.readers.times import SECONDS
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 

@@ -7,7 +7,7 @@ Time* is ``time`` and ``signals.values``. A struct that is the only one names no
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
-    TIME_NAMES,
+    ToldStep,
+    agreed_step,
     kept_columns,
     no_time,
     rate_step,
@@ -27,11 +28,20 @@ from dfsm.data.readers.hawc2 import from_gtsdf, is_gtsdf
 from dfsm.data.readers.hdf5 import read_hdf5
 from dfsm.data.readers.mat4 import is_mat4, read_mat4
 from dfsm.data.readers.mat5 import OTHER, DamagedError, read_mat5
+from dfsm.data.readers.times import (
+    CAPITAL,
+    OTHER_NAMED,
+    SMALL,
+    capital_note,
+    counts_from_a_date,
+    rises,
+    seconds_of,
+    time_rank,
+)
 from dfsm.data.readers.wecsim import is_label, is_wecsim, wecsim_unit
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
-MAT_TIME_NAMES = (*TIME_NAMES, "tout")
 HDF5 = b"\x89HDF\r\n\x1a\n"
 # Columns of a matrix that are worth a channel each; more are pictures and mode shapes.
 _WIDEST = 100
@@ -70,7 +80,7 @@ def read_mat(path: Path, step: float | None = None) -> Trajectory:
 
 def _is_run(content: Mapping[str, Any]) -> bool:
     """Whether variables hold a time or `Channels`."""
-    return "Channels" in content or any(n.lower() in MAT_TIME_NAMES for n in content)
+    return "Channels" in content or any(_rank(n) is not None for n in content)
 
 
 def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:
@@ -90,9 +100,11 @@ def _from_channels(path: Path, content: Mapping[str, Any]) -> Trajectory:
             f"ChanName and {len(units)} ChanUnit; expected one column each: save them again"
         )
     channels = [Channel(n, u.strip("()[]")) for n, u in zip(names, units, strict=True)]
-    time = time_column(path, channels)
-    keep, notes = kept_columns(path, channels, list(table.T), time)
-    return assemble(path, table[:, time], table[:, keep], [channels[i] for i in keep], notes=notes)
+    at = time_column(path, channels, lambda i: rises(table[:, i]))
+    time, told = seconds_of(channels[at].name, channels[at].unit, table[:, at])
+    keep, notes = kept_columns(path, channels, list(table.T), at)
+    notes += [n for n in (told, capital_note(channels[at].name, channels[at].unit)) if n]
+    return assemble(path, time, table[:, keep], [channels[i] for i in keep], notes=notes)
 
 
 def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) -> Trajectory:
@@ -103,26 +115,34 @@ def _from_variables(path: Path, content: Mapping[str, Any], step: float | None) 
     numbers = {
         n: v for n, v in found.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiub"
     }
-    time_name = _time_name(numbers)
+    rates = _told_steps(numbers, step)
+    time_name = _time_name(numbers, [rate.step for rate in rates])
     notes: list[str] = []
+    told = ""
     if time_name is None:
-        time, rate = _without_time(path, found, numbers, step)
-        notes.append(f"there is no time: samples every {time[1] - time[0]:g} s, which {rate}")
+        raw, rate, notes = _without_time(path, found, numbers, rates)
+        time, told = raw, rate.name
     else:
-        time, rate = np.ravel(numbers[time_name]).astype(np.float64), ""
+        raw, called = np.ravel(numbers[time_name]).astype(np.float64), _last(time_name)
+        time, note = seconds_of(called, "", raw)
+        notes = [n for n in (note, capital_note(called, "")) if n]
+    chosen = None if time_name is None else _rank(time_name)
     columns: list[Array] = []
     channels: list[Channel] = []
     for name, value in found.items():
-        if name == time_name or (rate and f"'{name}'" in rate):
+        if name in (time_name, told):
             continue
-        if name.rsplit(".", 1)[-1].lower() in MAT_TIME_NAMES and name in numbers:
-            if _same_times(numbers[name], time):
-                continue
+        rank = _rank(name) if name in numbers else None
+        # What is called elapsed or the like beside a time is a signal; so is a T that differs.
+        same = rank is not None and _same_times(numbers[name], raw)
+        if same and (rank != OTHER_NAMED or rank == chosen):
+            continue
+        if chosen is not None and rank is not None and rank <= max(chosen, SMALL):
             notes.append(f"'{name}' left out: it is another time than '{time_name}'")
             continue
         table = _along(numbers.get(name), len(time))
-        other = None if time_name is None else _own_time(name, numbers)
-        if table is None or (other is not None and not _same_times(numbers[other], time)):
+        other = None if chosen is None else _own_time(name, numbers, max(chosen, SMALL))
+        if table is None or (other is not None and not _same_times(numbers[other], raw)):
             notes.append(f"'{name}' left out: {_why(value, len(time), other)}")
             continue
         width = table.shape[1]
@@ -148,25 +168,59 @@ def _flat(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{name}", value
 
 
-def _time_name(numbers: Mapping[str, np.ndarray]) -> str | None:
-    """The time that lies least deep, the first of these."""
-    named = [
-        n
-        for n, v in numbers.items()
-        if n.rsplit(".", 1)[-1].lower() in MAT_TIME_NAMES and v.size > 1 and v.size == max(v.shape)
-    ]
-    return min(named, key=lambda n: n.count("."), default=None)
+def _last(name: str) -> str:
+    return name.rsplit(".", 1)[-1]
 
 
-def _own_time(name: str, numbers: Mapping[str, np.ndarray]) -> str | None:
-    """The time in the same struct as a variable, or in the nearest around it."""
+def _rank(name: str) -> int | None:
+    """As `time_rank`; Simulink calls the time tout."""
+    last = _last(name)
+    if last.lower() == "tout":
+        return time_rank("t" if last == "tout" else "T")
+    return time_rank(last)
+
+
+def _time_name(numbers: Mapping[str, np.ndarray], steps: Sequence[float]) -> str | None:
+    """The time: one that signals are as long as, that lies least deep, in the first struct.
+
+    Of several there the longest, of these by its name. What counts from a date comes behind them,
+    a T last: where it increases, by the steps that are told if any are.
+    """
+    vectors = {n: v for n, v in numbers.items() if v.size > 1 and v.size == max(v.shape)}
+    named = {n: rank for n in vectors if (rank := _rank(n)) is not None}
+    signals = [v for n, v in numbers.items() if named.get(n, CAPITAL) == CAPITAL]
+    usable = {
+        n: any(_along(s, vectors[n].size) is not None for s in signals if s is not vectors[n])
+        for n, rank in named.items()
+        if rank != CAPITAL or rises(np.ravel(vectors[n]).astype(np.float64), steps)
+    }
+    folders = list(dict.fromkeys(n.rpartition(".")[0] for n in usable))
+
+    def place(name: str) -> tuple[bool, bool, int, int, int, int]:
+        folder, rank = folders.index(name.rpartition(".")[0]), named[name]
+        size = vectors[name].size
+        return rank == CAPITAL, not usable[name], name.count("."), folder, -size, rank
+
+    best = min(usable, key=place, default=None)
+    if best is not None and not usable[best] and steps:
+        best = None
+    if best is None or named[best] == CAPITAL:
+        dated = (n for n, v in vectors.items() if counts_from_a_date(_last(n), np.ravel(v)))
+        return next(dated, best)
+    return best
+
+
+def _own_time(name: str, numbers: Mapping[str, np.ndarray], lowest: int) -> str | None:
+    """The time in the same struct as a variable, or in the nearest around it.
+
+    One whose name comes after this rank is a signal.
+    """
     folder = name
     while "." in folder:
         folder = folder.rsplit(".", 1)[0]
         for other in numbers:
-            if other.rpartition(".")[0] == folder and (
-                other.rsplit(".", 1)[-1].lower() in MAT_TIME_NAMES
-            ):
+            rank = _rank(other) if other.rpartition(".")[0] == folder else None
+            if rank is not None and rank <= lowest:
                 return other
     return None
 
@@ -176,28 +230,42 @@ def _same_times(values: np.ndarray, time: Array) -> bool:
     return other.shape == time.shape and bool(np.allclose(other, time, rtol=1e-9, atol=0.0))
 
 
+def _told_steps(numbers: Mapping[str, np.ndarray], step: float | None) -> list[ToldStep]:
+    """Intervals between samples that are told, or stand in variables."""
+    if step is not None:
+        return [ToldStep(step, "", "was told")]
+    told = {
+        name: rate_step(_last(name), float(value.ravel()[0]))
+        for name, value in numbers.items()
+        if value.size == 1
+    }
+    return [ToldStep(s, n, f"stands in '{n}'") for n, s in told.items() if s is not None]
+
+
 def _without_time(
-    path: Path, found: Mapping[str, Any], numbers: Mapping[str, np.ndarray], step: float | None
-) -> tuple[Array, str]:
-    """Times of a record that tells its rate, and where that stands."""
-    source = "was told"
-    for name, value in numbers.items():
-        if step is None and value.size == 1:
-            step = rate_step(name.rsplit(".", 1)[-1], float(value.ravel()[0]))
-            source = f"stands in '{name}'"
-    if step is None and found.get("output") is OTHER:
+    path: Path,
+    found: Mapping[str, Any],
+    numbers: Mapping[str, np.ndarray],
+    rates: Sequence[ToldStep],
+) -> tuple[Array, ToldStep, list[str]]:
+    """Times of a record that tells its rate, where that stands, and what to tell."""
+    if not rates and found.get("output") is OTHER:
         raise DfsmError(
             f"{path}: no time, and 'output' is an object that only MATLAB reads: save it as a "
             "struct (output = struct(output); save('run.mat', 'output'))"
         )
-    if step is None:
+    if not rates:
         raise no_time(path, [Channel(f"{n} ({_what(v)})") for n, v in found.items()])
-    lengths = [max(v.shape) for v in numbers.values() if v.size > 1]
+    lengths = [
+        max(v.shape) for n, v in numbers.items() if v.size > 1 and _rank(n) in (None, CAPITAL)
+    ]
     if not lengths:
         raise DfsmError(f"{path}: no signal, expected vectors of one length beside the rate")
     # Signals of one record have one length; the one that most of them have.
     count = max(dict.fromkeys(lengths), key=lengths.count)
-    return uniform_times(path, count, step), source
+    rate, others = agreed_step(path, rates)
+    note = f"there is no time: samples every {rate.step:g} s, which {rate.source}"
+    return uniform_times(path, count, rate.step), rate, [n for n in (note, others) if n]
 
 
 def _along(values: np.ndarray | None, count: int) -> Array | None:

@@ -23,8 +23,11 @@ from numpy.typing import NDArray
 from dfsm.core.files import existing_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
+from dfsm.data.readers.columns import check_seconds, split_header
+from dfsm.data.readers.headers import NAME_AND_UNIT, without_repeats
 from dfsm.data.readers.long_run import LONG, LongRun, long_run
 from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
+from dfsm.data.readers.times import seconds_of
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -289,8 +292,8 @@ def _unit(text: str) -> str:
 def _read_text(path: Path) -> Trajectory:
     text = decode(path, "text or binary OpenFAST output")
     lines = text.split("\n")
-    at, names, units = _text_header(path, lines)
-    below = at + (units is not None)
+    header = _text_header(path, lines)
+    names, units, below = header.names, header.units, header.end
     rows = [
         Row(i, blank_cells(line))
         for i, line in enumerate(lines[below:], start=below + 1)
@@ -310,17 +313,24 @@ def _read_text(path: Path) -> Trajectory:
         ),
         wrong=lambda _: "correct it, or rerun with a wider OutFmt",
     )
+    heads = [blank_cells(line) for line in lines[header.at : below]]
+    rows, repeats = without_repeats(rows, heads[0], heads[1:])
     table = read_rows(rows, layout)
-    units = units or [""] * len(names)
+    # Some drivers leave the unit of the time open.
+    if units[0] != "-":
+        check_seconds(path, names[0], units[0])
     channels = [
-        Channel(n, _unit(u), s)
-        for n, u, s in zip(names[1:], units[1:], table.steps[1:], strict=True)
+        Channel(n, u, s) for n, u, s in zip(names[1:], units[1:], table.steps[1:], strict=True)
     ]
-    time, values, notes = table.values[:, 0], table.values[:, 1:], list(table.notes)
+    time, values = table.values[:, 0], table.values[:, 1:]
+    notes = [*table.notes, *([repeats] if repeats else [])]
     for j in table.words:
         notes.append(f"'{names[j]}' holds words ('{rows[0].cells[j][:24]}'): its samples are NaN")
     if table.stamps is not None:
         notes.append(table.stamps.note(names[0]))
+    else:
+        time, counted = seconds_of(names[0], units[0], time)
+        notes += [counted] if counted else []
     if path.suffix.lower().startswith(ROSCO_LOG) and len(time) > 1 and time[0] == time[1]:
         # ROSCO is called once before the simulation starts, and logs that call, too.
         time, values = time[1:], values[1:]
@@ -330,26 +340,36 @@ def _read_text(path: Path) -> Trajectory:
     return assemble(path, time, values, channels, notes=notes)
 
 
-def _text_header(path: Path, lines: list[str]) -> tuple[int, list[str], list[str] | None]:
-    """Find the line (from 1) with the names, the names, and the units of the next line if any.
+@dataclass(frozen=True)
+class _TextHeader:
+    """Line of the names and that of the first row, from 0; names, and units ("" for none)."""
+
+    at: int
+    end: int
+    names: list[str]
+    units: list[str]
+
+
+def _text_header(path: Path, lines: list[str]) -> _TextHeader:
+    """Find the line with the names, and the units beside them or in the next line if any.
 
     Drivers write headers of other lengths than OpenFAST, so the line is looked for.
     """
     for line, text in enumerate(lines[:HEADER_LINES], start=1):
         names = text.split()
-        if len(names) < 2 or names[0].lower() != "time":
+        if len(names) < 2 or split_header(names[0])[0].lower() != "time":
             continue
         below = lines[line] if line < len(lines) else ""
         first = below.split()[:1]
         if first and (_is_number(first[0])):
-            return line, names, None
+            return _TextHeader(line - 1, line, *_with_units(text, len(blank_cells(below))))
         # Between tabs a unit may hold blanks or be empty; so may one in brackets hold blanks.
         named, tabbed = _tabbed(text), _tabbed(below)
         if len(named) > 1 and len(named) == len(tabbed):
-            return line, named, tabbed
+            return _TextHeader(line - 1, line + 1, named, [_unit(u) for u in tabbed])
         for units in (below.split(), BRACKETED.findall(below)):
             if len(units) == len(names):
-                return line, names, units
+                return _TextHeader(line - 1, line + 1, names, [_unit(u) for u in units])
         # A title may begin with the word as well, but is not followed by units.
         if first and first[0].startswith(("(", "[")):
             raise DfsmError(
@@ -360,6 +380,18 @@ def _text_header(path: Path, lines: list[str]) -> tuple[int, list[str], list[str
         f"{path} is no OpenFAST output: no line that starts with 'Time' among its first "
         f"{HEADER_LINES} lines; check that it is the right file"
     )
+
+
+def _with_units(line: str, width: int) -> tuple[list[str], list[str]]:
+    """Names of as many columns as a row of numbers has, and the units that stand beside them."""
+    for names in (line.split(), _tabbed(line), NAME_AND_UNIT.findall(line)):
+        if len(names) == width:
+            split = [split_header(name) for name in names]
+            # Brackets belong to a name where the time has none.
+            if split[0][1]:
+                return [name for name, _ in split], [unit for _, unit in split]
+            return names, [""] * width
+    return line.split(), [""] * len(line.split())
 
 
 def _tabbed(line: str) -> list[str]:

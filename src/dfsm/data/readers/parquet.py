@@ -16,7 +16,6 @@ from dfsm.core.files import write_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
-    SECONDS,
     kept_columns,
     split_header,
     time_column,
@@ -24,7 +23,13 @@ from dfsm.data.readers.columns import (
 )
 from dfsm.data.readers.guard import check_run_name
 from dfsm.data.readers.long_run import LONG, LongRun, long_run
-from dfsm.data.readers.stamps import Stamps, since_first
+from dfsm.data.readers.parquet_times import (
+    is_stamped,
+    stamped_or_counted,
+    stamped_seconds,
+    time_index,
+)
+from dfsm.data.readers.times import seconds_of
 from dfsm.data.trajectory import Channel, Role, Trajectory
 from dfsm.errors import DfsmError
 
@@ -66,14 +71,15 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         at, start = None, _number(path, schema, "dfsm.time_start")
         time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
     else:
-        at = _time_index(path, table.schema, channels, schema, step)
+        at = time_index(path, table.schema, channels, schema.get("pandas"), columns, step)
         time = uniform_times(path, table.num_rows, step or 0.0) if at is None else columns[at]
     keep, notes = kept_columns(path, channels, columns, at)
-    for i in [i for i in keep if _is_stamped(fields[i])]:
+    for i in [i for i in keep if is_stamped(fields[i])]:
         keep.remove(i)
         notes.append(f"column '{channels[i].name}' left out: it holds time stamps beside the time")
-    if at is not None and (first := _first_stamp(table, at)):
-        notes.append(Stamps(time, first).note(channels[at].name))
+    if at is not None:
+        time, told = stamped_or_counted(table, at, channels[at], time)
+        notes += told
     if not keep:
         raise DfsmError(f"{path}: no channel besides time, at least one is needed")
     return assemble(
@@ -138,9 +144,12 @@ def long_parquet(path: Path) -> LongRun | None:
         pa.default_memory_pool().release_unused()
         return values
 
+    if at is not None:
+        time, told = seconds_of(channels[at].name, channels[at].unit, column(at))
+        notes = (*notes, *([told] if told else []))
     return long_run(
         path,
-        time if at is None else column(at),
+        time,
         tuple(channels[i] for i in keep),
         lambda place: column(keep[place]),
         name=name or None,
@@ -321,8 +330,8 @@ def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
     import pyarrow as pa
 
     kind = field.type
-    if _is_stamped(field):
-        return since_first(_nanoseconds(table, index))
+    if is_stamped(field):
+        return stamped_seconds(table, index)
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
         raise DfsmError(
             f"{path}: column '{field.name}' holds {kind}, expected numbers: leave it out"
@@ -335,66 +344,6 @@ def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
     if scale == 0:
         raise DfsmError(f"{path}: column '{field.name}' has a scale of 0: write the file again")
     return (values - _number(path, known, "offset")) / scale
-
-
-def _time_index(
-    path: Path,
-    schema: pa.Schema,
-    channels: list[Channel],
-    metadata: Mapping[str, str],
-    step: float | None,
-) -> int | None:
-    """Column that holds the time: by its name, or the index of a pandas table.
-
-    An index counts where its numbers are floats or stamps. None where only `step` tells the time.
-    """
-    import pyarrow as pa
-
-    try:
-        return time_column(path, channels)
-    except DfsmError:
-        try:
-            index = json.loads(metadata.get("pandas", "{}")).get("index_columns", [])
-        except (ValueError, AttributeError):
-            raise DfsmError(f"{path}: its pandas metadata are damaged; write it again") from None
-        if len(index) == 1 and isinstance(index[0], str) and index[0] in schema.names:
-            at = schema.names.index(index[0])
-            field = schema.field(at)
-            known = pa.types.is_floating(field.type) or _is_stamped(field)
-            if known and channels[at].unit in SECONDS:
-                return at
-        if step is not None:
-            return None
-        raise
-
-
-def _is_stamped(field: pa.Field) -> bool:
-    """Whether a column holds time stamps, times of day or durations."""
-    import pyarrow as pa
-
-    kind = field.type
-    return pa.types.is_timestamp(kind) or pa.types.is_time(kind) or pa.types.is_duration(kind)
-
-
-def _nanoseconds(table: pa.Table, index: int) -> NDArray[np.int64]:
-    """Stamps of a column in ns."""
-    import pyarrow as pa
-
-    column = table.column(index)
-    unit = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}[column.type.unit]
-    if pa.types.is_time32(column.type):
-        column = column.cast(pa.int32())
-    return column.cast(pa.int64()).to_numpy() * unit
-
-
-def _first_stamp(table: pa.Table, index: int) -> str | None:
-    """The first time stamp of a column as text; None where it holds numbers."""
-    import pyarrow as pa
-
-    kind = table.column(index).type
-    if not (pa.types.is_timestamp(kind) or pa.types.is_time(kind)):
-        return None
-    return str(table.column(index)[0].as_py()) if table.num_rows else None
 
 
 def _pandas_units(metadata: Mapping[str, str]) -> dict[str, str]:

@@ -32,8 +32,8 @@ def read_table(path: str | Path, step: float | None = None) -> Trajectory:
       any depth, or `Channels`, `ChanName` and `ChanUnit` as MATLAB's ``ReadFASTbinary`` returns
       them.
 
-    Time is the first column called ``Time`` or ``t`` in any case (``tout`` too in MAT), in s, or
-    holds time stamps, which become seconds since the first.
+    Time is the first column called ``Time`` in any case, else ``t`` (``tout`` too in MAT), in s, or
+    holds time stamps, which become seconds since the first; see `dfsm.data.readers.times`.
 
     Parameters
     ----------

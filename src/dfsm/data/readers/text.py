@@ -18,10 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from dfsm.core.types import Array
-from dfsm.data.readers.stamps import Stamps, is_stamp, read_stamps
+from dfsm.data.readers.stamps import Stamps, read_stamps, tells_time
 from dfsm.errors import DfsmError
 
-_FORTRAN = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+))(?:[dDqQ]([-+]?\d+)|([-+]\d{2,4}))")
+# Fortran always writes the point: without one it is a label (08-01), or half a date.
+_FORTRAN = re.compile(r"([-+]?(?:\d+\.\d*|\.\d+))(?:[dDqQ]([-+]?\d+)|([-+]\d{3}))")
 _STARS = re.compile(r"\*+")
 _MISSING = {"", "na", "n/a", "#n/a", "null", "none", "nan(ind)", "-nan(ind)"}
 _WINDOWS_NAN = re.compile(r"[-+]?1\.#(QNAN|SNAN|IND|INF)0*", re.IGNORECASE)
@@ -135,7 +136,8 @@ def number(text: str) -> float | None:
     """Value of a cell, NaN for a missing one, None for what is no number."""
     text = text.strip()
     try:
-        return float(text)
+        # Python takes 12_3 for a number; in a file it is a label.
+        return None if "_" in text else float(text)
     except ValueError:
         pass
     if text.lower() in _MISSING or _STARS.fullmatch(text):
@@ -173,7 +175,7 @@ def read_rows(rows: list[Row], layout: Layout) -> Table:
                 f"{width} {layout.columns}: {layout.ragged(row)}"
             )
     try:
-        values = np.array([row.cells for row in rows], dtype=np.float64).reshape(len(rows), width)
+        values = _plain([row.cells for row in rows]).reshape(len(rows), width)
         words, stamps = [], None
     except ValueError:
         values, words, stamps = _cell_by_cell(rows, layout)
@@ -186,18 +188,31 @@ def read_rows(rows: list[Row], layout: Layout) -> Table:
     return Table(values, tuple(words), steps, stamps, tuple(notes))
 
 
+def _plain(cells: Sequence[str] | Sequence[Sequence[str]]) -> Array:
+    """Numbers of cells that NumPy reads as they are, but for those that `number` takes for none.
+
+    Raises
+    ------
+    ValueError
+        Some are no such numbers.
+    """
+    if any("_" in cell if isinstance(cell, str) else "_" in "".join(cell) for cell in cells):
+        raise ValueError
+    return np.array(cells, dtype=np.float64)
+
+
 def _cell_by_cell(rows: list[Row], layout: Layout) -> tuple[Array, list[int], Stamps | None]:
     """Numbers that only a closer look makes out, columns of words, and time stamps."""
     values = np.full((len(rows), len(layout.names)), np.nan)
     words, stamps, wrong = [], None, list[tuple[int, int, str]]()
     for j in range(len(layout.names)):
         cells = [row.cells[j] for row in rows]
-        if j == layout.time and is_stamp(cells[0]):
+        if j == layout.time and tells_time(cells[0]):
             stamps = read_stamps(layout.path, layout.names[j], cells)
             values[:, j] = stamps.seconds
             continue
         try:
-            values[:, j] = np.array(cells, dtype=np.float64)
+            values[:, j] = _plain(cells)
             continue
         except ValueError:
             found = [number(cell) for cell in cells]
@@ -235,7 +250,7 @@ def _without_cut(rows: list[Row], layout: Layout, notes: list[str]) -> list[Row]
     at = layout.time or 0
     first = last.cells[at if at < len(last.cells) else 0]
     # A footer in words is told as such.
-    if not (_is_value(first) or is_stamp(first)):
+    if not (_is_value(first) or tells_time(first)):
         return rows
     # Words may stand in the last column.
     if whole and before and not any(_is_value(row.cells[-1]) for row in before):
@@ -281,7 +296,7 @@ def _without_footer(rows: list[Row], layout: Layout, notes: list[str]) -> list[R
 def _is_footer(row: Row, layout: Layout) -> bool:
     cells, width = row.cells, len(layout.names)
     at = layout.time if layout.time is not None and len(cells) == width else 0
-    if _is_value(cells[at]) or (layout.time is not None and is_stamp(cells[at])):
+    if _is_value(cells[at]) or (layout.time is not None and tells_time(cells[at])):
         return False
     return len(cells) != width or not any(_is_value(c) for c in cells)
 
