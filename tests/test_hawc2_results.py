@@ -1,7 +1,4 @@
-"""Results of HAWC2 as it writes them: times that are rounded to codes, integers with missing values.
-
-Written here as the formats go.
-"""
+"""Results of HAWC2 as it writes them: times rounded to codes, integers with missing values."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 The `.sel` holds a line with scans, channels, time and format, then one line per channel: its
 number in 12 characters, name in 31, unit in 11, description. Binary samples are 16-bit integers,
 channel after channel, in units of the scale factors at the end of the `.sel`; text goes row by row.
-The time is one of the channels: in binary its largest value is 32000 codes away from 0, so that 700 s
-come in steps of 0.022 s. Scans are equidistant, their interval is the time of the line over the scans.
+The time is one of the channels: in binary its largest value is 32000 codes away from 0, so that
+700 s come in steps of 0.022 s. Scans are equidistant, the time of the line over the scans apart.
 
 gtsdf is HDF5: names and units at the top, blocks with `data`, and with `gains` and `offsets` where
 samples are integers, whose largest is a missing value. A block has a `time`, or start and step.
@@ -169,8 +169,8 @@ def _times(path: Path, rough: Array, unit: float, announced: float) -> tuple[Arr
         return start + step * index, []
     if (np.diff(rough) <= 0).any():
         raise DfsmError(
-            f"{path}: its time channel comes in steps of {unit:.3g} s, in which scans fall together, "
-            "and no equal interval fits it: write the result as text or gtsdf"
+            f"{path}: its time channel comes in steps of {unit:.3g} s, in which scans fall "
+            "together, and no equal interval fits it: write the result as text or gtsdf"
         )
     return rough, [f"times are no equal steps and rounded to {unit:.3g} s, as their channel is"]
 
