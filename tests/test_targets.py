@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import CONFIG, DUFFING, Dfsm, changed, files_of, write_config
+from conftest import DUFFING, Dfsm, changed, files_of, write_config
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
 

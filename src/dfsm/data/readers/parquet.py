@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dfsm.core.files import write_file
 from dfsm.core.types import Array
+from dfsm.data.readers.arrow import is_stamped, without_words
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
     SECONDS,
@@ -46,7 +47,7 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
     Raises
     ------
     DfsmError
-        Damaged, without time, a column that is not numeric, or metadata that make no sense.
+        Damaged, without time or numbers, or metadata that make no sense.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -58,6 +59,8 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         raise _unreadable(path, error) from error
     schema = _texts(table.schema.metadata)
     _check_header(path, table, schema)
+    kinds = dict(zip(table.schema.names, table.schema.types, strict=True))
+    table, words = without_words(table)
     units = _pandas_units(schema)
     fields = [_with_shared(path, field, schema) for field in table.schema]
     channels = [_channel(path, field, units) for field in fields]
@@ -66,15 +69,25 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         at, start = None, _number(path, schema, "dfsm.time_start")
         time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
     else:
-        at = _time_index(path, table.schema, channels, schema, step)
+        try:
+            at = _time_index(path, table.schema, channels, schema, step)
+        except DfsmError:
+            _check_time_of_words(path, words)
+            raise
         time = uniform_times(path, table.num_rows, step or 0.0) if at is None else columns[at]
     keep, notes = kept_columns(path, channels, columns, at)
-    for i in [i for i in keep if _is_stamped(fields[i])]:
+    notes += [f"column '{name}' left out: it holds {told}" for name, told in words.items()]
+    for i in [i for i in keep if is_stamped(fields[i])]:
         keep.remove(i)
         notes.append(f"column '{channels[i].name}' left out: it holds time stamps beside the time")
     if at is not None and (first := _first_stamp(table, at)):
         notes.append(Stamps(time, first).note(channels[at].name))
     if not keep:
+        for name in words:
+            raise DfsmError(
+                f"{path}: column '{name}' holds {kinds[name]}, expected numbers: no other is there "
+                "besides the time, convert it"
+            )
         raise DfsmError(f"{path}: no channel besides time, at least one is needed")
     return assemble(
         path,
@@ -318,15 +331,8 @@ def _with_shared(path: Path, field: pa.Field, schema: Mapping[str, str]) -> pa.F
 
 
 def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
-    import pyarrow as pa
-
-    kind = field.type
-    if _is_stamped(field):
+    if is_stamped(field):
         return since_first(_nanoseconds(table, index))
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        raise DfsmError(
-            f"{path}: column '{field.name}' holds {kind}, expected numbers: leave it out"
-        )
     values = _floats(table.column(index))
     known = _texts(field.metadata)
     if "scale" not in known:
@@ -360,7 +366,7 @@ def _time_index(
         if len(index) == 1 and isinstance(index[0], str) and index[0] in schema.names:
             at = schema.names.index(index[0])
             field = schema.field(at)
-            known = pa.types.is_floating(field.type) or _is_stamped(field)
+            known = pa.types.is_floating(field.type) or is_stamped(field)
             if known and channels[at].unit in SECONDS:
                 return at
         if step is not None:
@@ -368,12 +374,17 @@ def _time_index(
         raise
 
 
-def _is_stamped(field: pa.Field) -> bool:
-    """Whether a column holds time stamps, times of day or durations."""
-    import pyarrow as pa
-
-    kind = field.type
-    return pa.types.is_timestamp(kind) or pa.types.is_time(kind) or pa.types.is_duration(kind)
+def _check_time_of_words(path: Path, words: Mapping[str, str]) -> None:
+    """Refuse a time that is no numbers; `words` are columns that were left out."""
+    for name, told in words.items():
+        try:
+            time_column(path, [Channel(split_header(name)[0])])
+        except DfsmError:
+            continue  # it is no time by its name
+        raise DfsmError(
+            f"{path}: its time '{name}' holds {told}, expected numbers in s or time stamps: "
+            "convert it"
+        )
 
 
 def _nanoseconds(table: pa.Table, index: int) -> NDArray[np.int64]:
