@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 from pathlib import Path
 from typing import Any
 
@@ -310,3 +311,12 @@ def test_openfast_s_text_without_units_may_count_days_as_well(tmp_path):
     run = read(put(tmp_path / "a.out", ["Time Wave1Elev", *rows]))
     np.testing.assert_array_equal(run.time, TIME)
     assert "numbers days as spreadsheets do" in run.notes[0]
+
+
+def test_times_of_day_beside_dates_that_change_are_refused_in_parquet(tmp_path):
+    days = [dt.date(2024, 3, 1), dt.date(2024, 3, 1), dt.date(2024, 3, 5), dt.date(2024, 3, 5)]
+    columns = {"Date": days, "Time": [dt.time(h) for h in (1, 2, 3, 4)], "A": [1.0, 2.0, 1.0, 3.0]}
+    with pytest.raises(DfsmError, match=r"'Time' holds times of day and 'Date' the dates: join"):
+        read(saved(tmp_path, "parquet", columns))
+    run = read(saved(tmp_path, "parquet", columns | {"Date": days[:1] * 4}))
+    np.testing.assert_array_equal(run.time, 3600.0 * np.arange(4))

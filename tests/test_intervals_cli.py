@@ -105,7 +105,7 @@ def test_bad_input_is_told_and_costs_nothing(here, dfsm, fitted, fresh, interval
             *("calibrate", "m", "-o", "n.json", "--config", "other.yaml"),
         ),
         "level is 90.0, expected a share": ("calibrate", "m", *runs, "-o", "n.json", "--level", 90),
-        "c1.parquet is one of the files to read": ("calibrate", "m", *runs, "-o", "c1.parquet"),
+        "c1.parquet: a file of intervals ends": ("calibrate", "m", *runs, "-o", "c1.parquet"),
         "manifest.json is one of the files": ("calibrate", "m", *runs, "-o", "m/manifest.json"),
         "there is no folder no": ("calibrate", "m", *runs, "-o", "no/n.json"),
         "i.jsn: no such file": ("simulate", "m", runs[0], "-o", "o.csv", "--intervals", "i.jsn"),

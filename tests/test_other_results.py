@@ -336,6 +336,17 @@ def test_a_uniform_wind_over_the_rotor(tmp_path):
     np.testing.assert_allclose(at, first, atol=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("directions", "told"), [((355, 364), 5), ((350, 375), 15), ((-4, 8), 8), ((725, 718), 5)]
+)
+def test_directions_that_wrap_are_told_as_they_blow(tmp_path, directions, told):
+    path = tmp_path / "turn.wnd"
+    path.write_text("".join(f"{9 * k} 8 {d} 0 0 0 0 0\n" for k, d in enumerate(directions)))
+    with pytest.warns(DfsmWarning, match=f"blows up to {told} deg sideways"):
+        wind = read_uniform(path, UniformSettings(hub_height=HUB))
+    assert abs(np.ptp(wind.columns[:, 1])) == abs(directions[1] - directions[0])
+
+
 def test_uniform_winds_with_upflow_and_other_references(tmp_path):
     path = tmp_path / "up.hh"
     path.write_text("0,9,0,1.0,0,0,0.2,0,30\n")

@@ -57,6 +57,43 @@ def test_rest_and_what_settles_stay(tmp_path):
     assert (len(settled), settled.notes) == (400, ())
 
 
+def columns(path: Path, values: np.ndarray) -> Trajectory:
+    names = "".join(f",c{i}" for i in range(values.shape[1]))
+    rows = [",".join(f"{v:.6g}" for v in row) for row in np.column_stack([T, values]).tolist()]
+    path.write_text("\n".join([f"Time{names}", *rows]) + "\n")
+    return read(path)
+
+
+@pytest.mark.parametrize("level", [0.0, 25.0])
+@pytest.mark.parametrize("states", [1, 3])
+def test_a_system_at_rest_whose_outputs_follow_its_inputs_stays(tmp_path, level, states):
+    """Most channels jump with the inputs: what tells rest from nothing is a state."""
+    u = np.where(T < 6, 0.0, 2 + 0.2 * np.sin(1.1 * T))
+    rates = np.arange(1, states + 1) * 0.3
+    x = np.where(T < 6, 0.0, 1.0)[:, None] * (1 - np.exp(-np.outer(T - 6, rates)))
+    moved = np.stack([k * u + 0.3 * x[:, 0] for k in range(1, 9)], axis=1)
+    run = columns(tmp_path / "a.csv", level + np.column_stack([u, moved, x]))
+    assert len(run) == 400
+    (told,) = run.notes
+    assert "the first 60 rows (0 to 5.9 s)" in told
+    assert "some start from where they stood" in told
+    assert "kept, set a start behind them if nothing was recorded there" in told
+
+
+def test_zeros_before_a_record_are_left_out_though_some_channels_cross_zero(tmp_path):
+    rng = np.random.default_rng(5)
+    lost = 0
+    for k in range(20):
+        phase, rate = rng.uniform(0, 6.3, 9), rng.uniform(0.3, 1.5, 9)
+        values = np.round(rng.uniform(0.5, 2, 9) * np.sin(np.outer(T, rate) + phase), 4)
+        values[:, :7] += 3
+        values[:40] = 0
+        run = columns(tmp_path / f"{k}.csv", values)
+        assert run.time[0] == T[40] or "kept" in run.notes[0]
+        lost += run.time[0] == T[40]
+    assert lost >= 18
+
+
 def found(run: Trajectory, settings: FitSettings) -> np.ndarray:
     """Effects of the input and of the state on the state's derivative, without an offset."""
     samples = extract(select([run], settings), settings)

@@ -88,10 +88,10 @@ def test_a_result_never_replaces_what_it_was_made_of(here, dfsm, fitted):
     validate = ("validate", fitted, "d.outb", "--wall-times", "w.json")
     for command in (
         ("simulate", fitted, "a.csv", "-o", "./a.csv"),
-        (*validate, "-o", "d.outb"),
         (*validate, "--json", "w.json"),
     ):
         assert "is one of the files to read" in dfsm(*command).sentence
+    assert "a page ends in .html" in dfsm(*validate, "-o", "d.outb").sentence
     assert files_of(here) == before
 
 

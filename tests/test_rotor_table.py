@@ -64,6 +64,31 @@ def test_rosco_table_is_read_as_it_stands():
 
 
 @pytest.mark.parametrize(
+    "heading",
+    [
+        "{} coefficient (rows: TSR, columns: pitch angle)",
+        "{} coefficient",
+        "[pitch angle across, TSR down] {} coefficient",
+        "Over TSR and pitch angle: {} coefficient",
+        "{} coefficient, rows along the TSR axis",
+        "({} coefficient)",
+    ],
+)
+def test_headings_of_rosco_may_tell_their_axes(tmp_path, heading):
+    c = coefficients()
+    lines = ["# Rotor performance, power coefficient over pitch angle and TSR"]
+    lines += ["# Pitch angle vector, 5 entries - x axis of the power coefficient (deg)"]
+    lines += [" ".join(f"{v:g}" for v in PITCH), "# TSR vector, 6 entries - y axis (-)"]
+    lines += [" ".join(f"{v:g}" for v in RATIO), "# Wind speed vector - z axis (m/s)", "11.0"]
+    for name, field in {"Power": "cp", "Thrust": "ct", "Torque": "cq"}.items():
+        lines += ["", f"# {heading.format(name)}", ""]
+        lines += [" ".join(f"{v:.9f}" for v in row) for row in c[field]]
+    table = read_rotor_table(written(tmp_path / "Cp_Ct_Cq.txt", lines))
+    for field, values in c.items():
+        np.testing.assert_allclose(getattr(table, field), values, atol=1e-8)
+
+
+@pytest.mark.parametrize(
     ("header", "factor", "delimiter"),
     [
         ("Pitch (deg),TSR,Cp,Ct,Cq", 1.0, ","),

@@ -27,6 +27,7 @@ from dfsm.cli.optimize import optimize
 from dfsm.cli.report import report
 from dfsm.cli.simulate import simulate
 from dfsm.cli.sweep import sweep
+from dfsm.cli.targets import check_json, check_page, check_spared
 from dfsm.cli.terminal import (
     AsJson,
     Files,
@@ -270,7 +271,7 @@ def validate(
     """Simulate test runs, compare with what was recorded, write a report."""
     from dfsm.cli.tables import print_validation
     from dfsm.core.fallback import write_or_keep
-    from dfsm.core.files import check_file, write_json
+    from dfsm.core.files import write_json
     from dfsm.data.readers import read_all, with_wall_times
     from dfsm.models.model_folder import NONLINEAR, load_all
     from dfsm.report import write_report
@@ -280,8 +281,10 @@ def validate(
 
     settings = marching(method, step, interpolation)
     targets = [path for path in (output, metrics) if path is not None]
-    for path in targets:
-        check_file(path)
+    if output is not None:
+        check_page(output)
+    if metrics is not None:
+        check_json(metrics, "a file of figures")
     models = load_all(model)
     main = next(iter(models.values()))
     start = fit_start(main) if start is None else start
@@ -289,8 +292,8 @@ def validate(
     with working(quiet):
         runs = as_in_fit(main, parametrized(read_all(files, step=sample_step), parameters))
         tell_notes(runs, quiet)
-        for path in targets:
-            check_file(path, [wall_times, intervals, parameters, *(r.source for r in runs)])
+        sources = [wall_times, intervals, parameters, *(r.source for r in runs)]
+        check_spared(targets, model, main, sources, sample_step)
         if wall_times is not None:
             runs = with_wall_times(runs, wall_times)
         candidates = compared(main, models.get(NONLINEAR))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dfsm.cli.targets import check_page, check_spared
 from dfsm.cli.terminal import AsJson, Files, Quiet, fit_start, print_json, say, working
 from dfsm.errors import DfsmError, hushed, near_matches
 
@@ -60,7 +61,7 @@ def closed_loop(
     """Close the loop between a model and a controller, and compare with what was recorded."""
     from dfsm.cli.tables import print_article
     from dfsm.core.fallback import write_or_keep
-    from dfsm.core.files import check_file, check_together
+    from dfsm.core.files import check_together
     from dfsm.data.readers import read_all
     from dfsm.models.model_folder import load
     from dfsm.report.article_page import write_article
@@ -68,6 +69,8 @@ def closed_loop(
     from dfsm.simulation.loop_cases import ClosedLoopSettings
     from dfsm.validation.closed_loop import validate_closed_loop
 
+    if report is not None:
+        check_page(report)
     settings = ClosedLoopSettings(start_up=start_up)
     stand_ins = pairs(measure or [])
     surrogate = load(model)
@@ -77,8 +80,7 @@ def closed_loop(
         targets = [_file(run) for run in runs]
         check_together(output, [*targets, _FIGURES])
         kept = [output / target for target in targets if (output / target).exists()]
-        for target in (*kept, *([report] if report else [])):
-            check_file(target, [run.source for run in runs])
+        check_spared([*kept, report], model, surrogate, [run.source for run in runs])
         sampled = runs[0].time_step
         law = controller_of(controller, library, interval or sampled)
         validation = validate_closed_loop(

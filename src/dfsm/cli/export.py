@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from dfsm.cli.targets import check_spared
 from dfsm.cli.terminal import Quiet, lines, say
 
 exports = typer.Typer(
@@ -36,7 +37,9 @@ def state_space(
     from dfsm.models.model_folder import load
 
     check_suffix(output)
-    made = to_state_space(load(model), None if at is None else at.split(","))
+    loaded = load(model)
+    check_spared([output], model, loaded)
+    made = to_state_space(loaded, None if at is None else at.split(","))
     made.save(output)
     for point in () if quiet else made:
         where = "" if made.schedule is None else f"{made.schedule.name} = {point.schedule:.4g}: "
@@ -52,7 +55,9 @@ def casadi(model: Model, output: File, quiet: Quiet = False) -> None:
     from dfsm.models.model_folder import load
 
     check_file(output)
-    functions = to_casadi(load(model))
+    loaded = load(model)
+    check_spared([output], model, loaded)
+    functions = to_casadi(loaded)
     functions.save(output)
     _tell(output, functions.description["notes"], quiet)
 
@@ -99,7 +104,9 @@ def fmu(
     from dfsm.exports.fmu import write_fmu
     from dfsm.models.model_folder import load
 
-    made = write_fmu(load(model), output, fmi=fmi, kind=kind, step=step)  # pyright: ignore[reportArgumentType]
+    loaded = load(model)
+    check_spared([output], model, loaded)
+    made = write_fmu(loaded, output, fmi=fmi, kind=kind, step=step)  # pyright: ignore[reportArgumentType]
     what = (
         "sources alone: no C compiler here"
         if made.binary is None

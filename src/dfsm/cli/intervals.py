@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from dfsm.cli.targets import check_json, check_spared
 from dfsm.cli.terminal import (
     ParameterFile,
     Quiet,
@@ -48,14 +49,13 @@ def calibrate(
     from dfsm.cli.tables import print_intervals
     from dfsm.config.fit import load_config
     from dfsm.core.fallback import write_or_keep
-    from dfsm.core.files import check_file
     from dfsm.data.readers import read_all
     from dfsm.errors import DfsmError
     from dfsm.models.model_folder import load
     from dfsm.selection.left_out import check_is_of, cross_calibrate
     from dfsm.validation.calibrate import calibrate as run_calibrate
 
-    check_file(output)
+    check_json(output, "a file of intervals")
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     if (config is None) == (not files):
@@ -67,12 +67,14 @@ def calibrate(
         if config is None:
             runs = as_in_fit(surrogate, parametrized(read_all(files or []), parameters))
             tell_notes(runs, quiet)
-            check_file(output, [*model.iterdir(), parameters, *(run.source for run in runs)])
+            sources = [parameters, *(run.source for run in runs)]
+            check_spared([output], model, surrogate, sources)
             intervals = run_calibrate(surrogate, runs, level=level, start=start, stop=stop)
         else:
             known, runs = load_config(config)
             tell_notes(runs, quiet)
-            check_file(output, [*model.iterdir(), config, *(run.source for run in runs)])
+            sources = [config, *(run.source for run in runs)]
+            check_spared([output], model, surrogate, sources, known.data.step)
             check_is_of(surrogate, runs, config)
             intervals = cross_calibrate(
                 surrogate, runs, known.fit_settings(), known.refine, level=level

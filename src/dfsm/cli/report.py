@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from dfsm.cli.targets import check_page, check_spared
 from dfsm.cli.terminal import Quiet, lines, say
 
 
@@ -17,13 +18,12 @@ def report(
 ) -> None:
     """Write a model card: what taught a model, where it holds, what it is good for."""
     from dfsm.core.fallback import write_or_keep
-    from dfsm.core.files import check_file
     from dfsm.models.model_folder import load
     from dfsm.report.model_card import write_model_card
 
-    check_file(output)
+    check_page(output)
     loaded = load(model)
-    check_file(output, model.iterdir())
+    check_spared([output], model, loaded)
     name = model.resolve().name
     write_or_keep(lambda path: write_model_card(loaded, path, name=name), output)
     say(lines(f"wrote {output}"), quiet)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from dfsm.cli.targets import check_spared
 from dfsm.cli.terminal import (
     AsJson,
     Interpolation,
@@ -65,8 +66,9 @@ def simulate(
     settings = marching(method, step, interpolation)
     every = step if sample_step is None else sample_step
     table_suffix(output)
-    check_file(output, [path for path in (run, inputs, intervals) if path and Path(path).exists()])
+    check_file(output)
     surrogate = load(model)
+    check_spared([output], model, surrogate, [run, inputs, intervals, parameters], every)
     start = fit_start(surrogate) if start is None else start
     calibrated = None if intervals is None else load_intervals(intervals)
     if calibrated is not None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dfsm.cli.loops import loaded
+from dfsm.cli.targets import check_spared
 from dfsm.cli.terminal import AsJson, Quiet, fit_start, print_json, say, working
 from dfsm.errors import hushed, printable
 
@@ -40,6 +41,8 @@ def sweep(
     check_together(output, [_FIGURES, _TABLE, _PAGE])
     with working(quiet), hushed():
         found = loaded(asked, config.parent)
+        sources = [config, *(run.source for run in found.runs)]
+        check_spared([output / _TABLE], config.parent / asked.model, found.model, sources)
         controllers = gain_grid(found.controller, asked.gains, found.discon)
         swept = run_sweep(
             found.model,

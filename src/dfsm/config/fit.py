@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr, ValidationError, field_validator
 
-from dfsm.config.parse import Strict, explain, load_yaml, parse_file
+from dfsm.config.parse import Strict, check_truths, explain, load_yaml, parse_file
 from dfsm.core.settings import require
 from dfsm.data.between import Between
 from dfsm.data.derivatives import DerivativeSettings, StateSpec, state_names
@@ -287,6 +287,7 @@ def _candidate(
             )
     merged = _merged(raw, changes)
     try:
+        check_truths(merged, Config)
         config = Config.model_validate(merged).at(folder)
         _check_together(config)
     except ValidationError as error:

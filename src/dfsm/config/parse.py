@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dfsm.config.yaml_text import read_yaml
+from dfsm.data.readers.text import decode
 from dfsm.errors import DfsmError, near_matches
 
 Parsed = TypeVar("Parsed", bound=BaseModel)
+_COMMA = re.compile(r"[-+]?\d+,\d+")
+_Keys = tuple[int | str, ...]
+# Where Latin-1 has control characters, Windows has dashes and quotation marks.
+_WINDOWS = {code: bytes([code]).decode("cp1252", "replace") for code in range(0x80, 0xA0)}
 
 
 class Strict(BaseModel):
@@ -38,6 +45,7 @@ def parse_file(path: Path, kind: type[Parsed], advice: str) -> Parsed:
     """
     raw = load_yaml(path, advice)
     try:
+        check_truths(raw, kind)
         return kind.model_validate(raw)
     except ValidationError as error:
         raise DfsmError(f"{path}: {explain(error, raw, kind)}") from None
@@ -52,7 +60,10 @@ def load_yaml(path: Path, advice: str) -> dict[str, Any]:
         hint = f"did you mean {inside[0]}?" if len(inside) == 1 else f"name one, or {advice}"
         raise DfsmError(f"{path} is a folder, a configuration file was expected: {hint}")
     try:
-        text = path.read_text(encoding="utf-8")
+        # Editors of Windows save a comment with an umlaut in letters of its own, or as UTF-16.
+        text = decode(path, "a configuration").translate(_WINDOWS)
+    except DfsmError:
+        raise DfsmError(f"{path} is not valid YAML (it is no text): {advice}") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None)
         if reason is None:
@@ -68,6 +79,37 @@ def load_yaml(path: Path, advice: str) -> dict[str, Any]:
     return raw
 
 
+def check_truths(raw: Any, kind: type[BaseModel]) -> None:
+    """Refuse true and false where a number is expected: taken for 1 and 0 they say something else.
+
+    Raises
+    ------
+    DfsmError
+        The path of the key as it stands in the file.
+    """
+    schema = kind.model_json_schema()
+    for keys, value in _truths(raw, ()):
+        types = [node.get("type", "boolean") for node in _schemas(keys, schema)]
+        if "boolean" not in types and {"number", "integer"} & set(types):
+            raise DfsmError(f"'{_written(keys)}': a number was expected, not {str(value).lower()}")
+
+
+def _truths(node: Any, keys: _Keys) -> Iterator[tuple[_Keys, bool]]:
+    """Every true and false with the path of its key."""
+    if isinstance(node, bool):
+        yield keys, node
+    elif isinstance(node, dict):
+        for key, value in node.items():
+            yield from _truths(value, (*keys, key))
+    elif isinstance(node, list):
+        for place, value in enumerate(node):
+            yield from _truths(value, (*keys, place))
+
+
+def _written(keys: Sequence[int | str]) -> str:
+    return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
+
+
 def explain(
     error: ValidationError, raw: dict[str, Any], kind: type[BaseModel], prefix: str = ""
 ) -> str:
@@ -77,8 +119,7 @@ def explain(
         # Raised by a settings class itself, already one sentence.
         return str(first.get("ctx", {}).get("error", first["msg"]))
     keys = _path(first["loc"], raw)
-    where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys).lstrip(".")
-    where = prefix + where
+    where = prefix + _written(keys)
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _known_keys(keys[:-1], raw, kind)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
@@ -92,6 +133,8 @@ def explain(
         hint = near_matches(str(named), _kinds(keys, kind))
         return f"'{where}.kind' is '{named}', expected one of {kinds}; {hint}"
     value = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
+    if isinstance(first["input"], str) and _COMMA.fullmatch(first["input"].strip()):
+        value += ", which has a decimal comma: write a point"
     message = _MESSAGES.get(first["type"], first["msg"])
     return f"'{where}': {message[0].lower()}{message[1:]}{value}"
 
@@ -125,7 +168,7 @@ def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
 
 def _known_keys(keys: list[int | str], raw: Any, kind: type[BaseModel]) -> list[str]:
     """Keys that may stand at a path, from the JSON schema of the configuration."""
-    nodes = _schemas(keys, kind)
+    nodes = _schemas(keys, kind.model_json_schema())
     for key in keys:
         raw = raw[key]
     kinds = [n for n in nodes if _kind(n) == raw.get("kind")]
@@ -134,15 +177,15 @@ def _known_keys(keys: list[int | str], raw: Any, kind: type[BaseModel]) -> list[
 
 def _kinds(keys: list[int | str], kind: type[BaseModel]) -> list[str]:
     """Values that the key 'kind' may have at a path."""
-    return [name for node in _schemas(keys, kind) if (name := _kind(node))]
+    return [name for node in _schemas(keys, kind.model_json_schema()) if (name := _kind(node))]
 
 
 def _kind(node: dict[str, Any]) -> str | None:
     return node.get("properties", {}).get("kind", {}).get("const")
 
 
-def _schemas(keys: list[int | str], kind: type[BaseModel]) -> list[dict[str, Any]]:
-    schema = kind.model_json_schema()
+def _schemas(keys: Sequence[int | str], schema: dict[str, Any]) -> list[dict[str, Any]]:
+    """What may stand at a path, from the JSON schema of the configuration."""
     nodes = [schema]
     for key in keys:
         nodes = [child for node in nodes for child in _children(schema, node, key)]
@@ -150,7 +193,11 @@ def _schemas(keys: list[int | str], kind: type[BaseModel]) -> list[dict[str, Any
 
 
 def _children(schema: dict[str, Any], node: dict[str, Any], key: int | str) -> list[dict[str, Any]]:
-    child = node.get("items") if isinstance(key, int) else node.get("properties", {}).get(key)
+    if isinstance(key, int):
+        places = node.get("prefixItems", [])
+        child = places[key] if key < len(places) else node.get("items")
+    else:
+        child = node.get("properties", {}).get(key)
     if child is None:
         child = node.get("additionalProperties")
     if not isinstance(child, dict):

@@ -108,7 +108,10 @@ class _Reader:
     def mapping(self, node: MappingNode, depth: int) -> dict[Any, Any]:
         own: dict[Any, Any] = {}
         merged: dict[Any, Any] = {}
+        before: Node | None = None
         for key_node, value_node in node.value:
+            _check_decimal_comma(before, key_node, value_node)
+            before = value_node
             if str(key_node.tag) == f"{_TAG}merge":
                 for part in self.parts(value_node, depth):
                     merged = part | merged
@@ -167,6 +170,23 @@ class _Reader:
         return DfsmError(
             f"{_line(node.start_mark)}: not valid YAML (could not determine a constructor for the "
             f"tag {str(node.tag)[:60]!r}): a configuration has none, leave it out"
+        )
+
+
+def _check_decimal_comma(before: Node | None, key: Node, value: Node) -> None:
+    """Refuse ``{weight: 1,5}``, which YAML takes for a weight of 1 and a key 5."""
+    texts = [n.value for n in (before, key, value) if isinstance(n, ScalarNode)]
+    if (
+        len(texts) == 3
+        and before is not None
+        and str(before.tag) == f"{_TAG}int"
+        and str(key.tag) in (f"{_TAG}int", f"{_TAG}float")
+        and not texts[2]
+        and key.start_mark.index == before.end_mark.index + 1
+    ):
+        raise DfsmError(
+            f"{_line(key.start_mark)}: {texts[0]},{texts[1]} has a decimal comma, which parts keys "
+            f"here: write {texts[0]}.{texts[1]}"
         )
 
 

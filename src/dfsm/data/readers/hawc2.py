@@ -3,11 +3,14 @@
 The `.sel` holds a line with scans, channels, time and format, then one line per channel: its
 number in 12 characters, name in 31, unit in 11, description. Binary samples are 16-bit integers,
 channel after channel, in units of the scale factors at the end of the `.sel`; text goes row by row.
+The time is one of the channels: in binary its largest value is 32000 codes away from 0, so that
+700 s come in steps of 0.022 s. Scans are equidistant, the time of the line over the scans apart.
 
 gtsdf is HDF5: names and units at the top, blocks with `data`, and with `gains` and `offsets` where
-samples are integers, whose smallest is a missing value. A block has a `time`, or start and step.
+samples are integers, whose largest is a missing value. A block has a `time`, or start and step.
 
-Sources: HAWC2 manual, section "output"; General Time Series Data Format 1.0 (DTU Wind Energy).
+Sources: HAWC2 manual, section "output"; General Time Series Data Format 1.0 (DTU Wind Energy), and
+its reader and writer in Wind Energy Toolbox (DTU), gtsdf.py.
 """
 
 from __future__ import annotations
@@ -24,13 +27,20 @@ from dfsm.core.files import existing_file
 from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import time_column
-from dfsm.data.readers.text import Layout, Row, blank_cells, decode, read_rows
+from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
 _NUMBER, _NAME, _UNIT = slice(0, 12), slice(12, 43), slice(43, 54)
 _SIZES = re.compile(r"\s*(\d+)\s+(\d+)\s+([-+.\deE]+)\s+(\w+)\s*")
 _BINARY, _TEXT = "BINARY", "ASCII"
+# The code of the largest value of a channel.
+_LARGEST_CODE = 32000
+# Share of a number that the six digits of a scale factor leave open, and s that the three decimals
+# of the time do.
+_ROUNDED, _LAST_DIGIT = 5e-6, 5e-4
+# Fewer intervals say nothing of a mesh.
+_FEWEST = 2
 
 
 def is_hawc2(path: Path) -> bool:
@@ -75,8 +85,11 @@ def read_hawc2(path: str | Path) -> Trajectory:
     notes = []
     if len(values) != scans:
         notes.append(f"{len(values)} scans, the .sel announces {scans}: the run ended early")
-    kept = [channels[i] for i in keep]
-    return assemble(path, values[:, at], values[:, keep], kept, notes=notes)
+    kept, time = [channels[i] for i in keep], values[:, at]
+    if scales is not None:
+        time, told = _times(sel, time, abs(scales[at]), number(sizes[3]) or 0.0)
+        notes += told
+    return assemble(path, time, values[:, keep], kept, notes=notes)
 
 
 def _channels(
@@ -112,6 +125,56 @@ def _binary(path: Path, scans: int, scales: Sequence[float]) -> Array:
     return codes * np.asarray(scales)
 
 
+def _times(path: Path, rough: Array, unit: float, announced: float) -> tuple[Array, list[str]]:
+    """Times in s of scans whose time channel is rounded to codes, and what is to be told of them.
+
+    Parameters
+    ----------
+    path
+        The `.sel`.
+    rough
+        Times in s as the channel has them, shape ``(time,)``.
+    unit
+        A code of the channel in s.
+    announced
+        Time that the `.sel` states for all scans, in s.
+
+    Raises
+    ------
+    DfsmError
+        Codes are too far apart to tell scans apart, and no equal interval goes through them.
+    """
+    last = len(rough) - 1
+    if last < _FEWEST or not unit > 0:
+        return rough, []
+    index = np.arange(len(rough))
+    slope = float(np.polyfit(index, rough, 1)[0])
+    steps = [announced / (last + 1), announced / last]
+    steps += [float(f"{slope:.{digits}g}") for digits in range(1, 10)]
+    slack = _ROUNDED * float(np.abs(rough).max()) + _LAST_DIGIT
+    for step in steps:
+        if not 0 < step < np.inf:
+            continue
+        starts = rough - step * index
+        room = unit - float(np.ptp(starts))
+        if room < -slack:
+            continue
+        # The largest time lies on its code; of all others, the middle of what they leave open.
+        largest = round(abs(rough[-1]) / unit) == _LARGEST_CODE
+        start = float(starts[-1] if largest else (starts.max() + starts.min()) / 2)
+        # Simulations start at 0, so that times are multiples of their step.
+        whole = round(start / step)
+        if abs(whole * step - start) <= max(room, 0.0) / 2 + slack:
+            return (whole + index) * step, []
+        return start + step * index, []
+    if (np.diff(rough) <= 0).any():
+        raise DfsmError(
+            f"{path}: its time channel comes in steps of {unit:.3g} s, in which scans fall "
+            "together, and no equal interval fits it: write the result as text or gtsdf"
+        )
+    return rough, [f"times are no equal steps and rounded to {unit:.3g} s, as their channel is"]
+
+
 def _text(path: Path, count: int) -> Array:
     text = decode(path, "text of HAWC2")
     lines = enumerate(text.split("\n"), start=1)
@@ -130,7 +193,8 @@ def _text(path: Path, count: int) -> Array:
 
 def is_gtsdf(content: Mapping[str, Any]) -> bool:
     """Whether the content of an HDF5 file is a General Time Series Data Format."""
-    return str(content.get("@type", "")).lower() == "general time series data format"
+    kind = np.ravel(np.asarray(content.get("@type", "")))
+    return kind.size == 1 and str(kind[0]).lower() == "general time series data format"
 
 
 def from_gtsdf(path: Path, content: Mapping[str, Any]) -> Trajectory:
@@ -141,8 +205,10 @@ def from_gtsdf(path: Path, content: Mapping[str, Any]) -> Trajectory:
     DfsmError
         No block, or blocks that do not fit together.
     """
-    blocks = [content[n] for n in sorted(content) if re.fullmatch(r"block\d+", n)]
-    parts = [_block(path, b) for b in blocks if isinstance(b, Mapping) and "data" in b]
+    blocks = {n: content[n] for n in sorted(content) if re.fullmatch(r"block\d+", n)}
+    parts = [
+        _block(path, n, b) for n, b in blocks.items() if isinstance(b, Mapping) and "data" in b
+    ]
     if not parts or len({v.shape[1] for _, v in parts}) > 1:
         raise DfsmError(f"{path}: it holds no blocks of samples that fit together: write it again")
     time, values = (np.concatenate(p) for p in zip(*parts, strict=True))
@@ -165,19 +231,37 @@ def from_gtsdf(path: Path, content: Mapping[str, Any]) -> Trajectory:
     )
 
 
-def _block(path: Path, block: Mapping[str, Any]) -> tuple[Array, Array]:
+def _block(path: Path, name: str, block: Mapping[str, Any]) -> tuple[Array, Array]:
     """Times in s and samples ``(time, signal)`` of one block."""
     raw = np.atleast_2d(np.asarray(block["data"]))
     values = raw.astype(np.float64)
     if raw.dtype.kind in "iu":
-        values[raw == np.iinfo(raw.dtype).min] = np.nan
-    values = values * np.ravel(block.get("gains", 1.0)) + np.ravel(block.get("offsets", 0.0))
-    if "time" in block:
-        time = np.ravel(block["time"]).astype(np.float64)
-        time = time * float(block.get("@time_step", 1.0)) + float(block.get("@time_start", 0.0))
-    else:
-        step = float(block.get("@time_step", 1.0))
-        time = float(block.get("@time_start", 0.0)) + step * np.arange(len(values))
+        values[raw == np.iinfo(raw.dtype).max] = np.nan
+    gains, offsets = np.ravel(block.get("gains", 1.0)), np.ravel(block.get("offsets", 0.0))
+    if not {len(gains), len(offsets)} <= {1, values.shape[1]}:
+        raise DfsmError(
+            f"{path}: {name} has {len(gains)} gains and {len(offsets)} offsets for "
+            f"{values.shape[1]} signals: write it again"
+        )
+    values = values * gains + offsets
+    step, start = (
+        _one_number(path, name, block, key, usual)
+        for key, usual in (("time_step", 1.0), ("time_start", 0.0))
+    )
+    time = np.ravel(block.get("time", np.arange(len(values)))).astype(np.float64)
     if len(time) != len(values):
         raise DfsmError(f"{path}: {len(time)} times for {len(values)} samples: write it again")
-    return time, values
+    return time * step + start, values
+
+
+def _one_number(
+    path: Path, block: str, content: Mapping[str, Any], key: str, usual: float
+) -> float:
+    """Attribute of a block that is a number, or an array of one; `usual` where there is none."""
+    found = np.ravel(np.asarray(content.get(f"@{key}", usual)))
+    if found.size != 1 or found.dtype.kind not in "fiu" or not np.isfinite(found[0]):
+        shown = ", ".join(str(v) for v in found[:4])[:60]
+        raise DfsmError(
+            f"{path}: {key} of {block} is '{shown}', one number in s was expected: write it again"
+        )
+    return float(found[0])

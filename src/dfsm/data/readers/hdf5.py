@@ -4,7 +4,8 @@ The library under h5py follows offsets that the file states, and on damaged ones
 that calls it, or take all memory: here that is a child with a limit on its memory. This file is its
 program, too, so that it starts without loading dfsm. MATLAB marks what its v7.3 holds with the
 attribute ``MATLAB_class``, stores arrays transposed, characters as numbers, and cell arrays as
-references (MathWorks, MAT-File Versions).
+references (MathWorks, MAT-File Versions). An array of structs is a group whose members are arrays
+of references without that attribute, one reference for each struct.
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ _MEMORY = 4 << 30
 _SECONDS = 300
 _NO_H5PY = 7
 _DEEPEST = 32
+# Values in a file; references of a damaged one may go round in circles.
+_MOST = 100_000
+_ELSE = "an array of another class"
 
 
 def read_hdf5(path: Path) -> dict[str, Any]:
-    """Everything in a file as nested dicts of arrays and texts; lists for cell arrays.
+    """Everything in a file as nested dicts of arrays and texts; lists for arrays of structs.
 
-    Attributes of a group stand under ``@name`` in it.
+    Cell arrays are arrays where all cells are texts, else lists. Attributes of a group stand under
+    ``@name`` in it.
 
     Raises
     ------
@@ -68,7 +73,17 @@ def _tree(flat: dict[str, np.ndarray]) -> dict[str, Any]:
         for folder in folders:
             group = group.setdefault(folder, {})
         group[last] = str(value) if value.dtype.kind == "U" and value.ndim == 0 else value
-    return content
+    return {name: _with_lists(value) for name, value in content.items()}
+
+
+def _with_lists(value: Any) -> Any:
+    """Lists for the elements that `_collect_elements` has numbered."""
+    if not isinstance(value, dict):
+        return value
+    inside = {name: _with_lists(v) for name, v in value.items()}
+    if inside and all(name.startswith("#") for name in inside):
+        return list(inside.values())
+    return inside
 
 
 # -- the child's program ------------------------------------------------------------------------
@@ -99,26 +114,73 @@ def _collect(group: Any, prefix: str, flat: dict[str, np.ndarray], depth: int) -
     for name, value in group.attrs.items():
         _keep(flat, f"{prefix}@{name}", np.asarray(value))
     for name in group:
-        if name.startswith("#"):  # where MATLAB keeps what references point to
-            continue
-        item = group[name]
-        if hasattr(item, "keys"):
-            _collect(item, f"{prefix}{name}/", flat, depth + 1)
-        elif getattr(item, "shape", None) is not None:
-            _keep(flat, f"{prefix}{name}", _value(item))
+        if not name.startswith("#"):  # where MATLAB keeps what references point to
+            _collect_item(group[name], f"{prefix}{name}", flat, depth)
+
+
+def _collect_item(item: Any, name: str, flat: dict[str, np.ndarray], depth: int) -> None:
+    """A struct, an array of structs, a cell array or a value."""
+    if depth > _DEEPEST or len(flat) > _MOST:
+        raise ValueError("its parts are too many or nested too deeply")
+    if hasattr(item, "keys"):
+        members = dict(item.items())
+        if not members or not all(_is_structs(m) for m in members.values()):
+            _collect(item, f"{name}/", flat, depth + 1)
+            return
+        targets = {n: _targets(m) for n, m in members.items()}
+        for place in range(max(map(len, targets.values()))):
+            for field, found in targets.items():
+                if place < len(found):
+                    _collect_element(found[place], f"{name}/#{place:06d}/{field}", flat, depth)
+    elif getattr(item, "shape", None) is not None and _is_references(item):
+        found = _targets(item)
+        if all(_class(target) == "char" for target in found):
+            _keep(flat, name, np.array([str(_value(target)) for target in found]))
+            return
+        for place, target in enumerate(found):
+            _collect_element(target, f"{name}/#{place:06d}", flat, depth)
+    elif getattr(item, "shape", None) is not None:
+        _keep(flat, name, _value(item))
+
+
+def _collect_element(item: Any, name: str, flat: dict[str, np.ndarray], depth: int) -> None:
+    """One of several, which keeps its place even where it holds nothing that is read."""
+    before = len(flat)
+    if item is not None:
+        _collect_item(item, name, flat, depth + 1)
+    if len(flat) == before:
+        flat[name] = np.array(_ELSE)
+
+
+def _class(item: Any) -> str:
+    kind = b"" if item is None else item.attrs.get("MATLAB_class", b"")
+    return kind.decode(errors="replace") if isinstance(kind, bytes) else str(kind)
+
+
+def _is_references(item: Any) -> bool:
+    kind = getattr(item, "dtype", None)
+    return kind is not None and "ref" in (kind.metadata or {})
+
+
+def _is_structs(item: Any) -> bool:
+    """Whether a member of a group is that of an array of structs; cell arrays have a class."""
+    return _is_references(item) and not _class(item)
+
+
+def _targets(item: Any) -> list[Any]:
+    """What references point to, in MATLAB's order; None where one points nowhere."""
+    if item.attrs.get("MATLAB_empty", 0):
+        return []
+    return [item.file[r] if r else None for r in np.ravel(item[()])]
 
 
 def _value(item: Any) -> np.ndarray:
-    kind = item.attrs.get("MATLAB_class", b"")
-    kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+    kind = _class(item)
     if item.attrs.get("MATLAB_empty", 0):
-        return np.empty(0)
+        return np.array("") if kind == "char" else np.empty(0)
     values = item[()]
     if kind == "char":
         return np.array("".join(chr(int(c)) for c in np.ravel(values)))
-    if kind == "cell":
-        inside = [_value(item.file[reference]) for reference in np.ravel(values)]
-        return np.array([str(v) for v in inside])
     return np.asarray(values).T if kind else np.asarray(values)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dfsm.core.files import write_file
 from dfsm.core.types import Array
+from dfsm.data.readers.arrow import changing_dates, is_stamped, without_words
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import (
     kept_columns,
@@ -24,7 +25,6 @@ from dfsm.data.readers.columns import (
 from dfsm.data.readers.guard import check_run_name
 from dfsm.data.readers.long_run import LONG, LongRun, long_run
 from dfsm.data.readers.parquet_times import (
-    is_stamped,
     stamped_or_counted,
     stamped_seconds,
     time_index,
@@ -51,7 +51,7 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
     Raises
     ------
     DfsmError
-        Damaged, without time, a column that is not numeric, or metadata that make no sense.
+        Damaged, without time or numbers, or metadata that make no sense.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -63,6 +63,9 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         raise _unreadable(path, error) from error
     schema = _texts(table.schema.metadata)
     _check_header(path, table, schema)
+    kinds = dict(zip(table.schema.names, table.schema.types, strict=True))
+    dates = changing_dates(table)
+    table, words = without_words(table)
     units = _pandas_units(schema)
     fields = [_with_shared(path, field, schema) for field in table.schema]
     channels = [_channel(path, field, units) for field in fields]
@@ -71,9 +74,16 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         at, start = None, _number(path, schema, "dfsm.time_start")
         time = start + _number(path, schema, "dfsm.time_step") * np.arange(table.num_rows)
     else:
-        at = time_index(path, table.schema, channels, schema.get("pandas"), columns, step)
+        try:
+            pandas = schema.get("pandas")
+            at = time_index(path, table.schema, channels, pandas, columns, step)
+        except DfsmError:
+            _check_time_of_words(path, words)
+            raise
+        _check_dates(path, table.schema, at, dates)
         time = uniform_times(path, table.num_rows, step or 0.0) if at is None else columns[at]
     keep, notes = kept_columns(path, channels, columns, at)
+    notes += [f"column '{name}' left out: it holds {told}" for name, told in words.items()]
     for i in [i for i in keep if is_stamped(fields[i])]:
         keep.remove(i)
         notes.append(f"column '{channels[i].name}' left out: it holds time stamps beside the time")
@@ -81,6 +91,11 @@ def read_parquet(path: Path, step: float | None = None) -> Trajectory:
         time, told = stamped_or_counted(table, at, channels[at], time)
         notes += told
     if not keep:
+        for name in words:
+            raise DfsmError(
+                f"{path}: column '{name}' holds {kinds[name]}, expected numbers: no other is there "
+                "besides the time, convert it"
+            )
         raise DfsmError(f"{path}: no channel besides time, at least one is needed")
     return assemble(
         path,
@@ -327,15 +342,8 @@ def _with_shared(path: Path, field: pa.Field, schema: Mapping[str, str]) -> pa.F
 
 
 def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
-    import pyarrow as pa
-
-    kind = field.type
     if is_stamped(field):
         return stamped_seconds(table, index)
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        raise DfsmError(
-            f"{path}: column '{field.name}' holds {kind}, expected numbers: leave it out"
-        )
     values = _floats(table.column(index))
     known = _texts(field.metadata)
     if "scale" not in known:
@@ -344,6 +352,30 @@ def _column(path: Path, table: pa.Table, index: int, field: pa.Field) -> Array:
     if scale == 0:
         raise DfsmError(f"{path}: column '{field.name}' has a scale of 0: write the file again")
     return (values - _number(path, known, "offset")) / scale
+
+
+def _check_dates(path: Path, schema: pa.Schema, at: int | None, dates: Sequence[str]) -> None:
+    """Refuse times of day beside dates that change: days between samples would be lost."""
+    import pyarrow as pa
+
+    if at is not None and dates and pa.types.is_time(schema.field(at).type):
+        raise DfsmError(
+            f"{path}: '{schema.names[at]}' holds times of day and '{dates[0]}' the dates: join "
+            "them to one column of time stamps"
+        )
+
+
+def _check_time_of_words(path: Path, words: Mapping[str, str]) -> None:
+    """Refuse a time that is no numbers; `words` are columns that were left out."""
+    for name, told in words.items():
+        try:
+            time_column(path, [Channel(split_header(name)[0])])
+        except DfsmError:
+            continue  # it is no time by its name
+        raise DfsmError(
+            f"{path}: its time '{name}' holds {told}, expected numbers in s or time stamps: "
+            "convert it"
+        )
 
 
 def _pandas_units(metadata: Mapping[str, str]) -> dict[str, str]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array
+from dfsm.data.readers.arrow import is_stamped
 from dfsm.data.readers.columns import named_time, time_column
 from dfsm.data.readers.stamps import Stamps, since_first
 from dfsm.data.readers.times import (
@@ -86,14 +87,6 @@ def time_index(
     if step is None:
         return time_column(path, channels, lambda i: rises(columns[i]))
     return None if wrong else named_time(path, channels, lambda i: rises(columns[i], [step]))
-
-
-def is_stamped(field: pa.Field) -> bool:
-    """Whether a column holds time stamps, times of day or durations."""
-    import pyarrow as pa
-
-    kind = field.type
-    return pa.types.is_timestamp(kind) or pa.types.is_time(kind) or pa.types.is_duration(kind)
 
 
 def stamped_seconds(table: pa.Table, index: int) -> Array:

@@ -48,6 +48,11 @@ _SECTIONS = {
 }
 
 
+_TABLES = ("cp", "ct", "cq")
+_BRACKETS = re.compile(r"\([^()]*\)|\[[^\[\]]*\]")
+_AXIS = re.compile(r"\b(vector|axis)\b")
+
+
 @dataclass(frozen=True, eq=False)
 class RotorTable:
     """Quasi-steady coefficients of a rotor.
@@ -86,7 +91,7 @@ class RotorTable:
         _check_axis(self.source, "blade pitch", self.pitch)
         _check_axis(self.source, "tip speed ratio", self.tip_speed_ratio)
         size = (len(self.tip_speed_ratio), len(self.pitch))
-        for name in ("cp", "ct", "cq"):
+        for name in _TABLES:
             _check_entries(self.source, name.capitalize(), getattr(self, name), size)
         _check_physics(self)
 
@@ -151,9 +156,18 @@ _EXPECTED = (
 
 
 def _section(line: str) -> str | None:
-    """What the lines behind a comment hold, if it says so."""
+    """What the lines behind a comment hold, if it says so.
+
+    A coefficient may be told with its axes: "Power coefficient (rows: TSR, columns: pitch angle)".
+    """
     folded = line.casefold()
-    return next((field for words, field in _SECTIONS.items() if words in folded), None)
+    for text in (_BRACKETS.sub(" ", folded), folded):
+        places = {text.find(words): field for words, field in _SECTIONS.items() if words in text}
+        found = [places[at] for at in sorted(places)]
+        tables = [field for field in found if field in _TABLES]
+        if found:
+            return tables[0] if tables and not _AXIS.search(text) else found[0]
+    return None
 
 
 def _rosco(path: Path, lines: Sequence[str]) -> RotorTable:
@@ -179,7 +193,7 @@ def _rosco(path: Path, lines: Sequence[str]) -> RotorTable:
         np.array([v for row in rows[field] for v in row]) for field in ("pitch", "tip_speed_ratio")
     )
     tables: dict[str, Array] = {}
-    for field in ("cp", "ct", "cq"):
+    for field in _TABLES:
         if field in rows:
             tables[field] = _matrix(path, field, rows[field], (len(ratio), len(pitch)))
     return _table(path, pitch, ratio, tables)
@@ -254,7 +268,7 @@ def _long(path: Path, lines: Sequence[str]) -> RotorTable:
             f"speed ratio {ratio[row]:g}, expected one for each of {size[1]} pitch angles and "
             f"{size[0]} ratios: export a complete table"
         )
-    tables = {field: np.zeros(size) for field in ("cp", "ct", "cq") if field in fields}
+    tables = {field: np.zeros(size) for field in _TABLES if field in fields}
     for field, table in tables.items():
         table[at_ratio, at_pitch] = fields[field]
     return _table(path, pitch, ratio, tables)

@@ -265,7 +265,9 @@ def _check(path: Path, rows: list[Row], columns: Array) -> None:
 
 def _tell_across(path: Path, columns: Array) -> None:
     """Warn of wind that no signal along the rotor's axis holds."""
-    turn, tilt = np.abs(columns[:, 2]), np.abs(columns[:, 8])
+    # 370 deg is 10 deg: the direction was made to go on where it wraps.
+    turn = np.abs((columns[:, 2] + 180) % 360 - 180)
+    tilt = np.abs(columns[:, 8])
     sideways = np.abs(np.sin(np.deg2rad(turn))).max()
     speed = np.maximum(np.abs(columns[:, 1]), 1e-9)
     upwards = (np.sin(np.deg2rad(tilt)) + np.abs(columns[:, 3]) / speed).max()
