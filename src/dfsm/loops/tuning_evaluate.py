@@ -33,6 +33,7 @@ from dfsm.simulation.loop import Path as LoopPath
 from dfsm.simulation.loop_cases import (
     ClosedLoopSettings,
     LoopCase,
+    checked_loops,
     enough_calls,
     padded,
     prepared_cases,
@@ -108,6 +109,7 @@ class Evaluator:
         loop: ClosedLoopSettings | None = None,
         measurements: Mapping[str, str] | None = None,
     ) -> None:
+        runs = checked_loops(model, runs, [tuned.controller], measurements, loop)
         if not is_compiled(tuned.controller):
             raise DfsmError(
                 f"{type(tuned.controller).__name__} is no equinox module, so JAX cannot "

@@ -35,6 +35,7 @@ from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_comp
 from dfsm.simulation.loop_cases import (
     ClosedLoopSettings,
     LoopCase,
+    checked_loops,
     enough_calls,
     padded,
     prepared_cases,
@@ -166,8 +167,9 @@ def closed_loop(
     Raises
     ------
     DfsmError
-        The model lacks what the controller reads or sets, a channel is missing or not finite, a
-        run is not longer than the start-up, or a library refuses.
+        What was given is no model, run, controller or settings; the model lacks what the controller
+        reads or sets, a channel is missing or not finite, a run is not longer than the start-up, or
+        a library refuses.
 
     Warns
     -----
@@ -175,7 +177,7 @@ def closed_loop(
         A control stays as recorded, a loop ended early, or was outside the training range for part
         of the time.
     """
-    batch = [runs] if isinstance(runs, Trajectory) else list(runs)
+    batch = checked_loops(model, runs, [controller], measurements, settings)
     if kept := not_commanded(model, controller):
         warnings.warn(
             f"the controller does not set {', '.join(kept)}: recorded values are taken",
@@ -229,7 +231,7 @@ def closed_loops(
     begin = clock.perf_counter()
     batch = _Batch(model, runs, controllers, measurements, window, settings)
     results = batch.each(lambda run: run, watched=True)
-    wall = (clock.perf_counter() - begin) / max(1, len(runs) * len(controllers))
+    wall = (clock.perf_counter() - begin) / max(1, sum(map(len, results)))
     return [[replace(run, wall_time=wall) for run in of_one] for of_one in results]
 
 
@@ -271,13 +273,13 @@ class _Batch:
         self, reduce: Callable[[ClosedLoopRun], Reduced], watched: bool = False
     ) -> list[list[Reduced]]:
         """What `reduce` makes of every loop, per controller in the order of the runs."""
-        model, controllers, count = self.model, self.controllers, len(self.runs)
+        model, controllers = self.model, self.controllers
+        runs = checked_loops(model, self.runs, controllers, self.measurements, self.settings)
+        count = len(runs)
         settings = self.settings or ClosedLoopSettings()
         wires = [connect(model, controller, self.measurements) for controller in controllers]
         intervals = [float(c.interval) for c in controllers]
-        cases = {
-            i: prepared_cases(model, self.runs, i, self.window, settings) for i in set(intervals)
-        }
+        cases = {i: prepared_cases(model, runs, i, self.window, settings) for i in set(intervals)}
         ready, cores = staged(model), os.cpu_count() or 1
         pairs = zip(wires, controllers, strict=True)
         rollers = [_roller(ready, its, controller, watched) for its, controller in pairs]
