@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -122,6 +123,9 @@ def test_what_a_controller_is_has_one_check(model, law, sentence):
         (lambda: Sensor(PI, delay=NAN), "delay is nan, expected seconds, at least 0"),
         (lambda: Sensor(PI, delay=np.inf), "delay is inf, expected seconds, at least 0"),
         (lambda: Sensor(PI, seed=0.5), "seed is 0.5, expected a whole number"),
+        (lambda: Sensor(PI, seed=1.0), "seed is 1.0, expected a whole number"),
+        (lambda: dfsm.read_rosco(42, interval=0.1), "path is 42, expected the path of a DISCON.IN"),
+        (lambda: dfsm.BladedLibrary(42, interval=0.1), "library is 42, expected the path"),
         (lambda: StateSpace([[NAN]], [[1]], [[1]], [[0]], **NAMES), "A is nan, expected a finite"),
         (lambda: StateSpace(1.0, [[1]], [[1]], [[0]], **NAMES), r"A of shape is \(\), expected"),
         (
@@ -147,6 +151,7 @@ def test_numbers_of_controllers_are_what_they_must_be(make, sentence):
         (lambda: dfsm.ClosedLoopSettings(step=np.inf), "step is inf, expected seconds"),
         (lambda: dfsm.SweepSettings(speed="q", rated_speed=0.0), "rated_speed is 0.0, expected"),
         (lambda: dfsm.SweepSettings(speed="q", rated_speed=NAN), "rated_speed is nan, expected"),
+        (lambda: dfsm.SweepSettings(power=3), "power is 3, expected the name of a signal"),
         (lambda: dfsm.SweepSettings(block=np.inf), "block is inf, expected seconds"),
         (lambda: dfsm.SweepSettings(years=NAN), "years is nan, expected more than 0"),
         (lambda: dfsm.SweepSettings(start=NAN), "start is nan, expected seconds, or None"),
@@ -155,6 +160,7 @@ def test_numbers_of_controllers_are_what_they_must_be(make, sentence):
         (lambda: Limit(measure="std", channel="q", at_most=NAN), "at_most of std of q is nan"),
         (lambda: Limit(measure="std", channel="q", at_least="1"), "at_least of std of q is '1'"),
         (lambda: Limit(measure="std", channel="q", at_most=np.inf), "at_most of std of q is inf"),
+        (lambda: replace(STD, measure=None), "measure is None, expected one of mean, std"),
         (lambda: replace(STD, weight="1"), "weight of std of q is '1', expected a number"),
         (lambda: replace(STD, scale=np.inf), "scale of std of q is inf, expected more than 0"),
         (lambda: replace(STD, exponent=np.inf), "exponent is inf, expected at least 1"),
@@ -165,11 +171,13 @@ def test_numbers_of_controllers_are_what_they_must_be(make, sentence):
         (lambda: replace(ASKED, weights=[1.0, NAN]), "one of the weights is nan, expected a"),
         (lambda: replace(ASKED, weights=[]), r"weights is \[\], expected one per run"),
         (lambda: replace(ASKED, parameters=["kp"]), r"parameters is \['kp'\], expected bounds"),
+        (lambda: replace(ASKED, parameters={3: (0, 1)}), r"names of parameters is \[3\], expected"),
         (lambda: replace(ASKED, parameters={"kp": 1.0}), "bounds of kp is 1.0, expected two"),
         (lambda: replace(ASKED, parameters={"kp": (1, NAN)}), "one of the bounds of kp is nan"),
         (lambda: replace(ASKED, objective=STD), "objective is .* expected a list of dfsm.Goal"),
         (lambda: replace(ASKED, constraints=[STD]), r"a term of the constraints is .*dfsm.Limit"),
         (lambda: TuneSettings(starts=1.5), "starts is 1.5, expected a whole number"),
+        (lambda: TuneSettings(starts=2.0), "starts is 2.0, expected a whole number"),
         (lambda: TuneSettings(seed=-1), "seed is -1, expected a whole number"),
         (lambda: TuneSettings(tolerance=NAN), "tolerance is nan, expected between 0 and 1"),
         (lambda: TuneSettings(pareto=1), "pareto is 1, expected 0, or a whole number from 2 on"),
@@ -177,6 +185,7 @@ def test_numbers_of_controllers_are_what_they_must_be(make, sentence):
         (lambda: dfsm.weibull_weights([8, NAN, 12], mean=9), "one of the winds is nan"),
         (lambda: dfsm.weibull_weights(8, mean=9), "winds is 8, expected one for every run"),
         (lambda: dfsm.weibull_weights([8, 12], mean=NAN), "mean is nan, expected m/s"),
+        (lambda: FlownRuns(3), "folder is 3, expected the path of a folder"),
         (lambda: SystemTruth("turbine"), "system is 'turbine', expected a dfsm.ODESystem"),
     ],
 )
@@ -195,6 +204,7 @@ def test_settings_of_loops_are_what_they_must_be(make, sentence):
         ({"runs": 3}, "runs is 3, expected runs"),
         ({"runs": []}, "no runs were given"),
         ({"measurements": ["q"]}, r"measurements is \['q'\], expected names of the model's"),
+        ({"measurements": {"q": 3}}, "measurements: q is 3, expected the name of a signal"),
         ({"settings": {"start_up": 0}}, r"settings is \{'start_up': 0\}, expected dfsm\."),
     ],
 )
@@ -264,6 +274,50 @@ def test_flown_runs_have_names_of_their_own(model, tmp_path):
     with pytest.raises(DfsmError, match=r"a/Run.csv and b/run.csv would both be looked for as .*"):
         dfsm.tune_with_truth(task, FlownRuns(tmp_path / "flown"))
     assert not (tmp_path / "flown").exists()
+
+
+def test_a_tuning_is_confirmed_by_what_flies_and_given_what_it_tunes(model):
+    task = TuningTask(model, [run_of(model)], PI, ASKED, None, None, TuneSettings(loop=AT_ONCE))
+    for truth in ("flown", FlownRuns):
+        with pytest.raises(DfsmError, match=r"expected a truth, which has a method run\(case\)"):
+            dfsm.tune_with_truth(task, truth)
+    with pytest.raises(DfsmError, match="value of kp is None, expected a number"):
+        task.given({})
+
+
+def test_a_table_has_loads_that_were_counted(model):
+    swept = dfsm.sweep(model, [run_of(model)], {"a": PI}, settings=dfsm.SweepSettings(loop=AT_ONCE))
+    with pytest.raises(DfsmError, match=r"exponent is 5\.5, expected one of 3, 4, 5, 10"):
+        swept.table(5.5)
+
+
+class _Leaves(eqx.Module):
+    """All its fields are leaves, names and interval too."""
+
+    kp: float = 0.4
+    interval: float = 0.1
+    measurements: tuple[str, ...] = ("q",)
+    measurement_units: tuple[str, ...] = ("m",)
+    commands: tuple[str, ...] = ("u0",)
+    command_units: tuple[str, ...] = ("N",)
+
+    def start(self, measurements, commands):
+        return ()
+
+    def step(self, state, measurements, time):
+        return state, jnp.array([-self.kp * measurements[0]])
+
+
+def test_names_and_interval_may_be_leaves_of_a_module(model):
+    run = run_of(model)
+    for law, name in ((_Leaves(), "kp"), (Actuator(_Leaves(), corner=8.0), "inner.kp")):
+        with dfsm.errors.hushed():
+            found = dfsm.closed_loop(model, run, law, settings=AT_ONCE)
+        assert found.status is dfsm.LoopStatus.COMPLETED
+        asked = replace(ASKED, parameters={name: (0.1, 2.0)})
+        own = TuneSettings(loop=AT_ONCE, iterations=2)
+        tuned = dfsm.tune(model, [run], law, asked, settings=own)
+        assert tuned.objective < tuned.before_objective
 
 
 def test_a_regulator_names_its_interval_and_what_is_accepted(model):

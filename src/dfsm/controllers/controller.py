@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import PurePath
 from typing import Any, Protocol, runtime_checkable
 
+from dfsm.controllers.traced import traced
 from dfsm.core.settings import require, require_list, require_number, shown
 from dfsm.errors import DfsmError
 
@@ -86,7 +87,7 @@ def require_texts(name: str, values: Any) -> None:
     DfsmError
         It is not.
     """
-    expected = f'a list of texts, as in {name.rpartition(": ")[2]}=["…"]'
+    expected = 'a list of texts, as in ["q", "v"]'
     require_list(name, values, expected)
     require(all(isinstance(value, str) for value in values), name, shown(values), expected)
 
@@ -133,4 +134,5 @@ def require_controller(found: Any, name: str = "") -> None:
     commands = list(found.commands)
     once = len(set(commands)) == len(commands)
     require(once, f"{of}commands", shown(commands), "each one once")
-    require_number(f"{of}interval", found.interval, INTERVAL, above=0)
+    if not traced(found.interval):
+        require_number(f"{of}interval", found.interval, INTERVAL, above=0)

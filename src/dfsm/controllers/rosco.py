@@ -41,8 +41,8 @@ from dfsm.controllers.rosco_blocks import (
 )
 from dfsm.controllers.rosco_deck import Modes, Power, deck_modes, deck_parameters, deck_power
 from dfsm.controllers.rosco_filters import FilterBank, Filtered, Measured, RoscoFilters
-from dfsm.controllers.signals import Signals, signals
-from dfsm.core.settings import require, require_number
+from dfsm.controllers.signals import BY_ROLE, Signals, signals
+from dfsm.core.settings import require, require_kind, require_number
 from dfsm.errors import DfsmError, near_matches
 
 # Pitch in rad that shifts the setpoint by SS_VSGain; share of the rated speed from which ROSCO
@@ -423,6 +423,7 @@ def read_rosco(
     """
     deck = discon if isinstance(discon, Discon) else read_discon(discon)
     require_number("interval", interval, INTERVAL, above=0)
+    require_kind("channels", channels, Mapping | None, BY_ROLE)
     modes, channels = deck_modes(deck), dict(channels or {})
     roles = ["generator_speed", "wind"]
     if modes.Fl_Mode:

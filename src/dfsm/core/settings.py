@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
@@ -74,7 +75,7 @@ def require_number(
     above, least, most
         The number lies above the first, and reaches the others at most.
     whole
-        Whether it is one without a fraction.
+        Whether it is of a type that counts: 2.0 is none.
     infinite
         Whether it may be infinite.
     optional
@@ -89,7 +90,7 @@ def require_number(
         return
     number = _number(value)
     holds = above < number and least <= number <= most
-    holds = holds and (infinite or math.isfinite(number)) and not (whole and number % 1)
+    holds = holds and (infinite or math.isfinite(number)) and not (whole and not _counts(value))
     require(holds, name, shown(value), expected)
 
 
@@ -104,6 +105,14 @@ def _number(value: object) -> float:
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
         return math.nan
+
+
+def _counts(value: object) -> bool:
+    try:
+        operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        return False
+    return True
 
 
 def require_list(name: str, values: object, expected: str) -> None:

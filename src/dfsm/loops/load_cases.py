@@ -13,7 +13,7 @@ from dfsm.core.settings import require, require_list, require_number, shown
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.numerics.fatigue import damage_by_exponent
+from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_by_exponent
 
 HOURS_PER_YEAR = 8766.0
 
@@ -79,6 +79,18 @@ class Figures:
 def case_figures(run: Trajectory) -> dict[str, Figures]:
     """Figures of every channel of a run."""
     return {name: Figures.of(run.time, run[name]) for name in run.names}
+
+
+def require_counted(exponent: float) -> None:
+    """Refuse a Wöhler exponent for which no loads are counted.
+
+    Raises
+    ------
+    DfsmError
+        Names those for which some are.
+    """
+    counted = ", ".join(f"{m:g}" for m in WOHLER_EXPONENTS)
+    require(exponent in WOHLER_EXPONENTS, "exponent", shown(exponent), f"one of {counted}")
 
 
 def require_weights(weights: Any, runs: int | None = None) -> None:

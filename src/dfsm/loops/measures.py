@@ -44,6 +44,7 @@ class Measure:
     reference: float | None = None
 
     def __post_init__(self) -> None:
+        require_kind("measure", self.measure, str, f"one of {', '.join(KINDS)}")
         if self.measure not in KINDS:
             raise DfsmError(
                 f"there is no measure '{self.measure}'; {near_matches(self.measure, KINDS)}"

@@ -27,7 +27,13 @@ from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
-from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures, require_weights
+from dfsm.loops.load_cases import (
+    HOURS_PER_YEAR,
+    Figures,
+    case_figures,
+    require_counted,
+    require_weights,
+)
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.extremes import block_maxima, extrapolated, fit_gumbel
@@ -77,6 +83,8 @@ class SweepSettings:
     def __post_init__(self) -> None:
         for name in ("start", "stop"):
             require_number(name, getattr(self, name), "seconds, or None", optional=True)
+        for name in ("power", "speed"):
+            require_kind(name, getattr(self, name), str | None, "the name of a signal, or None")
         require_kind("loop", self.loop, ClosedLoopSettings, "dfsm.ClosedLoopSettings(…)")
         require_number("block", self.block, "seconds, more than 0", above=0)
         require_number("years", self.years, "more than 0", above=0)
@@ -177,9 +185,15 @@ class Sweep(Drawn):
         ----------
         exponent
             Wöhler exponent of the damage-equivalent loads.
+
+        Raises
+        ------
+        DfsmError
+            One for which no loads were counted.
         """
         import pandas as pd
 
+        require_counted(exponent)
         lines = {}
         for swept in (self.recorded, *self.controllers):
             line: dict[str, float | None] = {
@@ -289,6 +303,7 @@ def gain_grid(
     """
     require_controller(controller)
     require_kind("gains", gains, Mapping, "values by the name of a gain, {'kp': [1.0, 2.0]}")
+    require_texts("names of gains", list(gains))
     texts = {name: _told_apart(name, values) for name, values in gains.items()}
     tuned, found = tunable(controller, gains, discon), {AS_IT_IS: controller}
     for values in product(*(by_text.items() for by_text in texts.values())) if gains else ():

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from dfsm.core.progress import track
-from dfsm.core.settings import require, require_kind, require_number, settings_class
+from dfsm.core.settings import require, require_kind, require_number, settings_class, shown
 from dfsm.core.types import Array
 from dfsm.data.conversion import in_units_of
 from dfsm.data.trajectory import Trajectory
@@ -233,6 +233,9 @@ def tune_with_truth(
     """
     require_kind("task", task, TuningTask, "dfsm.TuningTask(…)")
     require_kind("settings", settings, TrustSettings | None, "dfsm.TrustSettings(…)")
+    what = "a truth, which has a method run(case), as dfsm.SystemTruth and dfsm.FlownRuns have"
+    flies = callable(getattr(truth, "run", None)) and not isinstance(truth, type)
+    require(flies, "truth", shown(truth), what)
     if isinstance(truth, FlownRuns):
         truth.check(task.runs)
     settings = settings or TrustSettings()

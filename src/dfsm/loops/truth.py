@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -142,6 +143,7 @@ class FlownRuns:
     """
 
     def __init__(self, folder: str | Path) -> None:
+        require_kind("folder", folder, str | PathLike, "the path of a folder")
         self.folder = Path(folder)
 
     def check(self, runs: Sequence[Trajectory]) -> None:

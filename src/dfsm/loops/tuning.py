@@ -17,7 +17,7 @@ from dfsm.controllers.discon import Discon
 from dfsm.controllers.rosco import ROSCO
 from dfsm.controllers.tunable import Tunable, tunable
 from dfsm.core.progress import track
-from dfsm.core.settings import require_kind
+from dfsm.core.settings import require_kind, require_number
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
@@ -135,7 +135,14 @@ class TuningTask:
         ----------
         values
             Of the parameters, by name.
+
+        Raises
+        ------
+        DfsmError
+            One is missing.
         """
+        for name in self.tuned.names:
+            require_number(f"value of {name}", values.get(name), "a number")
         before = self.evaluator(self.tuned.start)
         search = self.search(before)
         theta = np.array([values[name] for name in self.tuned.names])

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from dfsm.controllers.controller import require_texts
 from dfsm.core.settings import (
     require,
     require_kind,
@@ -115,6 +116,7 @@ class TuningProblem:
     def __post_init__(self) -> None:
         bounds = "bounds by the name of a parameter, {'kp': (0.1, 2.0)}"
         require_kind("parameters", self.parameters, Mapping, bounds)
+        require_texts("names of parameters", list(self.parameters))
         require(bool(self.parameters), "parameters", "empty", "at least one, with its bounds")
         for name, terms, kind in (
             ("objective", self.objective, Goal),

@@ -18,11 +18,10 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar, overload
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
+from dfsm.controllers.traced import as_arrays
 from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
@@ -315,8 +314,7 @@ def _roller(
             return not bool(((x >= low) & (x <= high)).all())
 
         return lambda case, _: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
-    # Numbers as arrays: others would be compiled in, and each controller compiled anew.
-    numbers = jax.tree.map(jnp.asarray, controller)
+    numbers = as_arrays(controller)
 
     def compiled(_: LoopCase, padded_drive: Callable[[], Drive]) -> Path:
         drive = padded_drive()

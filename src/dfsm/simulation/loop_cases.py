@@ -136,6 +136,9 @@ def checked_loops(
             require_controller(by_name[one], f"controller {shown(one)}")
     stand_ins = "names of the model's signals by the names of measurements"
     require_kind("measurements", measurements, Mapping | None, stand_ins)
+    for name, signal in (measurements or {}).items():
+        require_kind("a name among measurements", name, str, "a text")
+        require_kind(f"measurements: {name}", signal, str, "the name of a signal of the model")
     require_kind("settings", settings, ClosedLoopSettings | None, "dfsm.ClosedLoopSettings(…)")
     return batch
 
