@@ -38,7 +38,9 @@ def closed_loop(
     ] = None,
     interval: Annotated[
         float | None,
-        typer.Option(help="Seconds between two calls of ROSCO; default the runs' samples."),
+        typer.Option(
+            help="Seconds between two calls of ROSCO or a library; default the runs' samples."
+        ),
     ] = None,
     measure: Annotated[
         list[str] | None,
@@ -60,8 +62,10 @@ def closed_loop(
 ) -> None:
     """Close the loop between a model and a controller, and compare with what was recorded."""
     from dfsm.cli.tables import print_article
+    from dfsm.core.bundle import check_no_bundle
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_together
+    from dfsm.data.apart import require_apart
     from dfsm.data.readers import read_all
     from dfsm.models.model_folder import load
     from dfsm.report.article_page import write_article
@@ -76,13 +80,14 @@ def closed_loop(
     surrogate = load(model)
     start = fit_start(surrogate) if start is None else start
     with working(quiet), hushed():  # the outcome is printed below
+        check_no_bundle(output)
         runs = read_all(files)
         targets = [_file(run) for run in runs]
+        require_apart(runs, [output / target for target in targets])
         check_together(output, [*targets, _FIGURES])
         kept = [output / target for target in targets if (output / target).exists()]
         check_spared([*kept, report], model, surrogate, [run.source for run in runs])
-        sampled = runs[0].time_step
-        law = controller_of(controller, library, interval or sampled)
+        law = controller_of(controller, library, interval, runs[0].time_step)
         validation = validate_closed_loop(
             surrogate,
             runs,
@@ -142,19 +147,47 @@ def pairs(texts: list[str]) -> dict[str, str]:
     return found
 
 
-def controller_of(text: str, library: Path | None, interval: float | None) -> Controller:
-    """ROSCO, a library, or an object of a Python file."""
+def controller_of(
+    text: str,
+    library: Path | None,
+    interval: float | None,
+    sampled: float | None,
+    told: str = "--interval",
+) -> Controller:
+    """ROSCO, a library, or an object of a Python file.
+
+    Parameters
+    ----------
+    text
+        A DISCON.IN, or a Python file and what it holds.
+    library
+        Reads the DISCON.IN; None for ROSCO in JAX.
+    interval
+        Seconds between two calls; None takes the runs' sampling interval `sampled`, if they have
+        one.
+    told
+        What the interval is called where it is set.
+
+    Raises
+    ------
+    DfsmError
+        There is no such controller, or a library or an interval for one in Python.
+    """
     path, sign, name = text.rpartition(":")
     if sign and path.endswith(".py"):
         if library is not None:
             raise DfsmError("--library goes with a DISCON.IN, not with a controller in Python")
+        if interval is not None:
+            raise DfsmError(
+                f"{told} goes with a DISCON.IN, not with a controller in Python, which has an "
+                f"interval of its own: set it in {path}, and leave {told} out"
+            )
         return _own(Path(path), name)
     if text.endswith(".py"):
         raise DfsmError(f"--controller is '{text}' without a name: {_HOLDS}")
+    interval = sampled if interval is None else interval
     if interval is None:
-        raise DfsmError(
-            "the runs have no common sampling interval: set the controller's --interval"
-        )
+        raise DfsmError(f"the runs have no common sampling interval: set the controller's {told}")
     if library is not None:
         from dfsm.controllers.bladed import BladedLibrary
 
@@ -165,7 +198,7 @@ def controller_of(text: str, library: Path | None, interval: float | None) -> Co
 
 
 def _own(path: Path, name: str) -> Controller:
-    from dfsm.controllers.controller import Controller
+    from dfsm.controllers.controller import require_controller
     from dfsm.core.files import existing_file
 
     path = existing_file(path)
@@ -187,10 +220,15 @@ def _own(path: Path, name: str) -> Controller:
         known = [n for n in vars(module) if not n.startswith("_")]
         raise DfsmError(f"{path} holds no '{name}'; {near_matches(name, known)}")
     found = getattr(module, name)
-    found = found() if isinstance(found, type) else found
-    if not isinstance(found, Controller):
-        raise DfsmError(
-            f"'{name}' of {path} is no controller: it needs measurements, measurement_units, "
-            "commands, command_units, interval, start and step"
-        )
+    if isinstance(found, type):
+        try:
+            found = found()
+        except DfsmError:
+            raise
+        except Exception as error:
+            raise DfsmError(
+                f"'{name}' of {path} is a class that fails with {type(error).__name__}: {error}; "
+                f"name an object of it, as in mine = {name}(…)"
+            ) from None
+    require_controller(found, f"'{name}' of {path}")
     return found

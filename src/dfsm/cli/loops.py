@@ -33,14 +33,16 @@ def loaded(config: LoopsConfig, folder: Path) -> Loaded:
     """
     from dfsm.controllers.discon import read_discon
     from dfsm.controllers.rosco import ROSCO
+    from dfsm.core.settings import require
     from dfsm.data.readers import read_all
     from dfsm.models.model_folder import load
 
     model = load(folder / config.model)
     named = [config.runs] if isinstance(config.runs, str) else config.runs
+    require(bool(named), "runs", "empty", "at least one result file or pattern")
     runs = read_all(named, folder)
-    interval = runs[0].time_step if config.interval is None else config.interval
-    controller = controller_of(str(folder / config.controller), None, interval)
+    path = str(folder / config.controller)
+    controller = controller_of(path, None, config.interval, runs[0].time_step, "interval")
     python = config.controller.rpartition(":")[0].endswith(".py")
     own = isinstance(controller, ROSCO) and not python
     deck = read_discon(folder / config.controller) if own else None

@@ -31,6 +31,7 @@ def sweep(
     """Close the loop with many gains over many runs: energy, loads, travel, extremes."""
     from dfsm.cli.tables import print_article
     from dfsm.config.sweep import load_sweep
+    from dfsm.core.bundle import check_no_bundle
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_together
     from dfsm.loops.sweep import gain_grid
@@ -38,6 +39,7 @@ def sweep(
     from dfsm.report.sweep_article import sweep_article
 
     asked = load_sweep(config)
+    check_no_bundle(output)
     check_together(output, [_FIGURES, _TABLE, _PAGE])
     with working(quiet), hushed():
         found = loaded(asked, config.parent)

@@ -76,8 +76,10 @@ def wind(
     quiet: Quiet = False,
 ) -> None:
     """Add the wind over the rotor, its slopes and harmonics to runs: disturbances to fit with."""
+    from dfsm.core.bundle import check_no_bundle
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_file
+    from dfsm.data.apart import require_apart
     from dfsm.data.readers import read_all
     from dfsm.data.readers.tables import write_table
 
@@ -85,10 +87,12 @@ def wind(
     told |= {"reference-height": reference_height, "reference-length": reference_length}
     radii = None if rings is None else _radii(rings)
     source = _open(field, box, told, last_first)
+    check_no_bundle(output)
     with working(quiet):
         runs = read_all(files, step=step)
         tell_notes(runs, quiet)
-        targets = _targets(runs, output)
+        targets = [output / f"{Path(run.where).stem}.parquet" for run in runs]
+        require_apart(runs, targets)
         output.mkdir(parents=True, exist_ok=True)
         for target in targets:
             check_file(target, [run.source for run in runs])
@@ -100,21 +104,6 @@ def wind(
     for run, target in zip(added, targets, strict=True):
         write_or_keep(partial(write_table, run), target)
         say(f"wrote {target} with {more}", quiet)
-
-
-def _targets(runs: Sequence[Trajectory], output: Path) -> list[Path]:
-    """One file per run, called after the file that it came from."""
-    taken: dict[str, Trajectory] = {}
-    for run in runs:
-        stem = Path(run.where).stem
-        # Systems differ in whether upper and lower case are different names.
-        other = taken.setdefault(stem.casefold(), run)
-        if other is not run:
-            raise DfsmError(
-                f"{other.where} and {run.where} would both be written to {output / stem}.parquet: "
-                "rename one of them, or write them to different folders"
-            )
-    return [output / f"{Path(run.where).stem}.parquet" for run in runs]
 
 
 def _radii(text: str) -> list[float]:

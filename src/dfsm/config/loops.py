@@ -49,7 +49,8 @@ class LoopsConfig(Strict):
         Share of the time of every run (of a scatter table, say), or a Weibull distribution; default
         equal.
     interval
-        Seconds between two calls of ROSCO; default the runs' samples.
+        Seconds between two calls of ROSCO; default the runs' samples. A controller of your own has
+        one of its own.
     measure
         Signal of the model by measurement of the controller.
     start, stop, start_up

@@ -8,9 +8,8 @@ from pydantic import Field
 
 from dfsm.config.loops import LoopsConfig
 from dfsm.config.parse import parse_file
-from dfsm.core.settings import require
+from dfsm.loops.load_cases import require_counted
 from dfsm.loops.sweep import SweepSettings
-from dfsm.numerics.fatigue import WOHLER_EXPONENTS
 
 _ADVICE = "write one as the documentation shows under 'Tuning'"
 
@@ -46,8 +45,7 @@ class SweepConfig(LoopsConfig):
         DfsmError
             An exponent for which no loads are counted, or what `SweepSettings` refuses.
         """
-        counted = ", ".join(f"{m:g}" for m in WOHLER_EXPONENTS)
-        require(self.exponent in WOHLER_EXPONENTS, "exponent", self.exponent, f"one of {counted}")
+        require_counted(self.exponent)
         return SweepSettings(
             start=start if self.start is None else self.start,
             stop=self.stop,

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.controllers.controller import require_texts
+from dfsm.controllers.fields import numbers, require_limits, require_numbers
 from dfsm.controllers.rosco_blocks import within
 from dfsm.controllers.traced import traced
 from dfsm.controllers.wrapper import Wrapper
-from dfsm.core.settings import require
 from dfsm.errors import DfsmError, missing
 
 
@@ -49,23 +50,27 @@ class Actuator(Wrapper):
     Raises
     ------
     DfsmError
-        A command that the controller does not set, or limits the wrong way round.
+        What is wrapped is no controller; a command that it does not set; a corner or rate that is
+        not above 0, a negative damping; or limits the wrong way round.
     """
 
-    corner: jax.Array | None = None
-    damping: jax.Array = eqx.field(converter=jnp.asarray, default=0.7)  # pyright: ignore[reportAssignmentType]
-    rate: jax.Array = eqx.field(converter=jnp.asarray, default=np.inf)  # pyright: ignore[reportAssignmentType]
+    corner: jax.Array | None = eqx.field(converter=numbers("corner", optional=True), default=None)
+    damping: jax.Array = eqx.field(converter=numbers("damping"), default=0.7)  # pyright: ignore[reportAssignmentType]
+    rate: jax.Array = eqx.field(converter=numbers("rate"), default=np.inf)  # pyright: ignore[reportAssignmentType]
     limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
     acts_on: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
+        if self.acts_on is not None:
+            require_texts("acts_on", self.acts_on)
         if lost := [n for n in self.acts_on or () if n not in self.inner.commands]:
             raise DfsmError(f"acts_on: the controller sets {missing(lost, self.inner.commands)}")
         if traced(self):
             return
-        require(bool(np.all(np.asarray(self.rate) > 0)), "rate", self.rate, "more than 0")
-        low, high = (np.asarray(limit) for limit in self.limits)
-        require(bool((low < high).all()), "limits", self.limits, "the lower one first")
+        require_numbers(self, "corner", "rad/s, more than 0, or None for none", above=0)
+        require_numbers(self, "damping", "at least 0", least=0)
+        require_numbers(self, "rate", "more than 0", above=0, infinite=True)
+        require_limits(self.limits)
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> ActuatorState:
         """At rest where the plant's controls are; see `Controller.start`."""

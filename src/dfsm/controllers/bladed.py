@@ -20,16 +20,18 @@ import weakref
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from dfsm.controllers.bladed_child import HEAD, NOT_LOADED
+from dfsm.controllers.controller import INTERVAL
 from dfsm.controllers.discon import FILES, Discon, read_discon, write_discon
 from dfsm.controllers.discon_check import check_discon
-from dfsm.controllers.signals import Signals, signals
+from dfsm.controllers.signals import BY_ROLE, Signals, signals
 from dfsm.core.files import existing_file
-from dfsm.core.settings import require
+from dfsm.core.settings import require_kind, require_number
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, DfsmWarning, printable
 
@@ -237,8 +239,15 @@ class BladedLibrary:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
+        require_kind("library", self.library, str | PathLike, "the path of a library")
+        deck = "a DISCON.IN: the path of a file, or dfsm.read_discon's"
+        require_kind("discon", self.discon, Discon | str | PathLike | None, deck)
+        require_kind("channels", self.channels, Mapping, BY_ROLE)
         set_(self, "library", existing_file(self.library))
-        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
+        require_number("interval", self.interval, INTERVAL, above=0)
+        for name in ("gearbox", "efficiency"):
+            require_number(name, getattr(self, name), "more than 0", above=0, optional=True)
+        require_number("blades", self.blades, "a whole number, at least 1", least=1, whole=True)
         if isinstance(self.discon, str | Path):
             set_(self, "discon", _input(self.discon))
         if isinstance(self.discon, Discon):

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Any, Protocol, runtime_checkable
+
+from dfsm.controllers.traced import traced
+from dfsm.core.settings import require, require_list, require_number, shown
+from dfsm.errors import DfsmError
+
+# What an interval is, in the sentences about others.
+INTERVAL = "seconds, more than 0"
 
 
 @runtime_checkable
@@ -58,3 +66,73 @@ class Controller(Protocol):
             In s.
         """
         ...
+
+
+_PARTS = (
+    "measurements",
+    "measurement_units",
+    "commands",
+    "command_units",
+    "interval",
+    "start",
+    "step",
+)
+
+
+def require_texts(name: str, values: Any) -> None:
+    """Refuse what is no list of texts; one text is none, whose letters would be taken for names.
+
+    Raises
+    ------
+    DfsmError
+        It is not.
+    """
+    expected = 'a list of texts, as in ["q", "v"]'
+    require_list(name, values, expected)
+    require(all(isinstance(value, str) for value in values), name, shown(values), expected)
+
+
+def require_controller(found: Any, name: str = "") -> None:
+    """Refuse what is no `Controller`, or one that no loop can be closed with.
+
+    Parameters
+    ----------
+    found
+        Anything.
+    name
+        How the sentence calls it; empty where nobody has to be told which it is.
+
+    Raises
+    ------
+    DfsmError
+        It is of another type, it lacks a part, names and units are not lists of as many texts, a
+        command is set twice, or the interval is not above 0.
+    """
+    of, name = f"{name}: " if name else "", name or "the controller given"
+    if isinstance(found, type):
+        raise DfsmError(f"{name} is {shown(found)}, expected an object of it: {found.__name__}(…)")
+    if isinstance(found, str | PurePath):
+        raise DfsmError(
+            f"{name} is {shown(found)}, expected a controller: dfsm.read_rosco reads a DISCON.IN, "
+            "dfsm.BladedLibrary opens a library"
+        )
+    if lost := [part for part in _PARTS if not hasattr(found, part)]:
+        raise DfsmError(
+            f"{name} is no controller: {shown(found)} has no {', '.join(lost)}, and a controller "
+            f"has {', '.join(_PARTS[:-1])} and {_PARTS[-1]}"
+        )
+    for part in ("start", "step"):
+        method = getattr(found, part)
+        require(callable(method), f"{of}{part}", shown(method), "a method")
+    for names, units in (("measurements", "measurement_units"), ("commands", "command_units")):
+        told, theirs = getattr(found, names), getattr(found, units)
+        require_texts(f"{of}{names}", told)
+        require_texts(f"{of}{units}", theirs)
+        require(len(told) > 0, f"{of}{names}", "empty", "at least one")
+        expected = f"one for each of the {names} {shown(told)}"
+        require(len(theirs) == len(told), f"{of}{units}", shown(theirs), expected)
+    commands = list(found.commands)
+    once = len(set(commands)) == len(commands)
+    require(once, f"{of}commands", shown(commands), "each one once")
+    if not traced(found.interval):
+        require_number(f"{of}interval", found.interval, INTERVAL, above=0)

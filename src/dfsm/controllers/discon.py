@@ -19,6 +19,7 @@ from typing import TypeAlias
 import numpy as np
 
 from dfsm.core.files import existing_file, write_file
+from dfsm.core.settings import require_kind
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, near_matches, printable
 
@@ -226,6 +227,7 @@ def read_discon(path: str | Path) -> Discon:
     DfsmError
         There is no such file, or it holds no keys of ROSCO.
     """
+    require_kind("path", path, str | os.PathLike, "the path of a DISCON.IN")
     path = existing_file(path)
     text = path.read_bytes().decode("utf-8", errors="surrogateescape")
     discon = Discon(path, tuple(re.findall(r"[^\n]*\n|[^\n]+", text)))

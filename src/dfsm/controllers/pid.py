@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.controllers.controller import require_controller
+from dfsm.controllers.fields import numbers, require_limits, require_numbers, texts
 from dfsm.controllers.rosco_blocks import lookup, unwound, within
 from dfsm.controllers.traced import traced
-from dfsm.core.settings import require
+from dfsm.core.settings import require, require_number
 
 
 class PIDState(NamedTuple):
@@ -50,25 +52,27 @@ class PID(eqx.Module):
     Raises
     ------
     DfsmError
-        An interval that is not positive, limits the wrong way round, or a schedule without points.
+        What `require_controller` refuses; other than one command, or one measurement and one that a
+        schedule follows; numbers that are none or not finite, limits the wrong way round, or
+        points that do not rise.
     """
 
-    kp: jax.Array = eqx.field(converter=jnp.asarray)
-    ki: jax.Array = eqx.field(converter=jnp.asarray)
-    measurements: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    commands: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    command_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    kp: jax.Array = eqx.field(converter=numbers("kp"))
+    ki: jax.Array = eqx.field(converter=numbers("ki"))
+    measurements: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    commands: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    command_units: tuple[str, ...] = eqx.field(static=True, converter=texts)
     interval: float = eqx.field(static=True)
-    setpoint: jax.Array = eqx.field(converter=jnp.asarray)
-    kd: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
+    setpoint: jax.Array = eqx.field(converter=numbers("setpoint"))
+    kd: jax.Array = eqx.field(converter=numbers("kd"), default=0.0)  # pyright: ignore[reportAssignmentType]
     limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
-    points: jax.Array | None = None
+    points: jax.Array | None = eqx.field(converter=numbers("points", optional=True), default=None)
     smoothing: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self) -> None:
-        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
-        require(self.smoothing >= 0, "smoothing", self.smoothing, "seconds, at least 0")
+        require_controller(self)
+        require_number("smoothing", self.smoothing, "seconds, at least 0", least=0)
         scheduled = self.points is not None
         require(
             len(self.measurements) == 1 + scheduled,
@@ -79,8 +83,8 @@ class PID(eqx.Module):
         require(len(self.commands) == 1, "commands", self.commands, "one")
         if traced(self):
             return
-        low, high = (float(limit) for limit in self.limits)
-        require(low < high, "limits", (low, high), "the lower one first")
+        require_numbers(self, "kp ki kd setpoint points", "a finite number")
+        require_limits(self.limits)
         if self.points is not None:
             rising = bool((np.diff(np.asarray(self.points)) > 0).all())
             require(rising, "points", np.asarray(self.points).tolist(), "values that rise")

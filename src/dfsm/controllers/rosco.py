@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from dfsm.controllers import rosco_wind as estimators
+from dfsm.controllers.controller import INTERVAL
 from dfsm.controllers.discon import Discon, read_discon
 from dfsm.controllers.rosco_blocks import (
     at_least,
@@ -40,8 +41,8 @@ from dfsm.controllers.rosco_blocks import (
 )
 from dfsm.controllers.rosco_deck import Modes, Power, deck_modes, deck_parameters, deck_power
 from dfsm.controllers.rosco_filters import FilterBank, Filtered, Measured, RoscoFilters
-from dfsm.controllers.signals import Signals, signals
-from dfsm.core.settings import require
+from dfsm.controllers.signals import BY_ROLE, Signals, signals
+from dfsm.core.settings import require, require_kind, require_number
 from dfsm.errors import DfsmError, near_matches
 
 # Pitch in rad that shifts the setpoint by SS_VSGain; share of the rated speed from which ROSCO
@@ -421,7 +422,8 @@ def read_rosco(
         not rise, or a channel that is none.
     """
     deck = discon if isinstance(discon, Discon) else read_discon(discon)
-    require(interval > 0, "interval", interval, "seconds, more than 0")
+    require_number("interval", interval, INTERVAL, above=0)
+    require_kind("channels", channels, Mapping | None, BY_ROLE)
     modes, channels = deck_modes(deck), dict(channels or {})
     roles = ["generator_speed", "wind"]
     if modes.Fl_Mode:

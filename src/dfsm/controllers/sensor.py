@@ -9,8 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.controllers.controller import require_texts
+from dfsm.controllers.fields import numbers, require_numbers
+from dfsm.controllers.traced import traced
 from dfsm.controllers.wrapper import Wrapper
-from dfsm.core.settings import require
+from dfsm.core.settings import require_number
 from dfsm.errors import DfsmError, missing
 
 
@@ -46,19 +49,27 @@ class Sensor(Wrapper):
     Raises
     ------
     DfsmError
-        A measurement that the controller does not read, or a negative delay.
+        What is wrapped is no controller; a measurement that it does not read; a corner that is not
+        above 0, a negative delay or noise; or a seed that is no whole number.
     """
 
-    corner: jax.Array | None = None
-    noise: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
+    corner: jax.Array | None = eqx.field(converter=numbers("corner", optional=True), default=None)
+    noise: jax.Array = eqx.field(converter=numbers("noise"), default=0.0)  # pyright: ignore[reportAssignmentType]
     delay: float = eqx.field(static=True, default=0.0)
     seed: int = eqx.field(static=True, default=0)
     acts_on: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        require(self.delay >= 0, "delay", self.delay, "seconds, at least 0")
+        require_number("delay", self.delay, "seconds, at least 0", least=0)
+        require_number("seed", self.seed, "a whole number", whole=True)
+        if self.acts_on is not None:
+            require_texts("acts_on", self.acts_on)
         if lost := [n for n in self.acts_on or () if n not in self.inner.measurements]:
             raise DfsmError(f"acts_on: the controller has {missing(lost, self.inner.measurements)}")
+        if traced(self):
+            return
+        require_numbers(self, "corner", "rad/s, more than 0, or None for none", above=0)
+        require_numbers(self, "noise", "at least 0", least=0)
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> SensorState:
         """The sensor has seen these for long; see `Controller.start`."""

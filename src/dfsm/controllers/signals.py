@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from dfsm.core.units import factor
 from dfsm.errors import DfsmError, near_matches
 
+# What channels are given as, in the sentences about others.
+BY_ROLE = "channels by role, {'wind': 'RotWind'}"
 # Role: channel as OpenFAST calls it, its unit, and the unit in SI.
 _ROLES: dict[str, tuple[str, str, str]] = {
     "generator_speed": ("GenSpeed", "rpm", "rad/s"),

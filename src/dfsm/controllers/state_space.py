@@ -11,8 +11,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from dfsm.controllers.controller import INTERVAL, require_controller
+from dfsm.controllers.fields import numbers, require_limits, require_numbers, texts
 from dfsm.controllers.rosco_blocks import unwound, within
-from dfsm.core.settings import require
+from dfsm.controllers.traced import traced
+from dfsm.core.settings import require, require_number
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 
@@ -37,28 +40,33 @@ class StateSpace(eqx.Module):
     Raises
     ------
     DfsmError
-        Shapes that do not fit each other.
+        What `require_controller` refuses, shapes that do not fit each other, numbers that are not
+        finite, or limits the wrong way round.
     """
 
-    A: jax.Array = eqx.field(converter=jnp.asarray)
-    B: jax.Array = eqx.field(converter=jnp.asarray)
-    C: jax.Array = eqx.field(converter=jnp.asarray)
-    D: jax.Array = eqx.field(converter=jnp.asarray)
-    measurements: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    commands: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    command_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    A: jax.Array = eqx.field(converter=numbers("A"))
+    B: jax.Array = eqx.field(converter=numbers("B"))
+    C: jax.Array = eqx.field(converter=numbers("C"))
+    D: jax.Array = eqx.field(converter=numbers("D"))
+    measurements: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    commands: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    command_units: tuple[str, ...] = eqx.field(static=True, converter=texts)
     interval: float = eqx.field(static=True)
-    y0: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
-    u0: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)  # pyright: ignore[reportAssignmentType]
+    y0: jax.Array = eqx.field(converter=numbers("y0"), default=0.0)  # pyright: ignore[reportAssignmentType]
+    u0: jax.Array = eqx.field(converter=numbers("u0"), default=0.0)  # pyright: ignore[reportAssignmentType]
     limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
 
     def __check_init__(self) -> None:
-        n, m, p = len(self.A), len(self.measurements), len(self.commands)
-        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
+        require_controller(self)
+        n = len(self.A) if self.A.ndim else 0
+        m, p = len(self.measurements), len(self.commands)
         for name, shape in (("A", (n, n)), ("B", (n, m)), ("C", (p, n)), ("D", (p, m))):
             matrix = getattr(self, name)
             require(matrix.shape == shape, f"{name} of shape", matrix.shape, f"shape {shape}")
+        if not traced(self):
+            require_numbers(self, "A B C D y0 u0", "a finite number")
+            require_limits(self.limits, equal=True)
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> jax.Array:
         """State whose command is this one, and among those the one nearest to rest."""
@@ -104,27 +112,33 @@ class StateFeedback(eqx.Module):
     Raises
     ------
     DfsmError
-        A gain of another shape.
+        What `require_controller` refuses, a gain of another shape, numbers that are not finite, or
+        limits the wrong way round.
     """
 
-    gain: jax.Array = eqx.field(converter=jnp.asarray)
-    x0: jax.Array = eqx.field(converter=jnp.asarray)
-    u0: jax.Array = eqx.field(converter=jnp.asarray)
-    measurements: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    commands: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    command_units: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    gain: jax.Array = eqx.field(converter=numbers("gain"))
+    x0: jax.Array = eqx.field(converter=numbers("x0"))
+    u0: jax.Array = eqx.field(converter=numbers("u0"))
+    measurements: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    measurement_units: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    commands: tuple[str, ...] = eqx.field(static=True, converter=texts)
+    command_units: tuple[str, ...] = eqx.field(static=True, converter=texts)
     interval: float = eqx.field(static=True)
-    integral_gain: jax.Array | None = None
+    integral_gain: jax.Array | None = eqx.field(
+        converter=numbers("integral_gain", optional=True), default=None
+    )
     limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
 
     def __check_init__(self) -> None:
-        require(self.interval > 0, "interval", self.interval, "seconds, more than 0")
+        require_controller(self)
         shape = (len(self.commands), len(self.measurements))
         for name in ("gain", "integral_gain"):
             gain = getattr(self, name)
             if gain is not None:
                 require(gain.shape == shape, f"{name} of shape", gain.shape, f"shape {shape}")
+        if not traced(self):
+            require_numbers(self, "gain integral_gain x0 u0", "a finite number")
+            require_limits(self.limits, equal=True)
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> jax.Array:
         """What integrals add to the commands, such that the first step continues these."""
@@ -172,9 +186,10 @@ def regulator_gain(
     Raises
     ------
     DfsmError
-        There is no such gain: a part that does not decay cannot be reached by the controls or is
-        not weighted.
+        An interval that is not above 0, or there is no such gain: a part that does not decay cannot
+        be reached by the controls or is not weighted.
     """
+    require_number("interval", interval, INTERVAL, above=0)
     F, G, q, r = (np.asarray(a, dtype=float) for a in (A, B, Q, R))
     n, m = G.shape
     # With the controls among the states, which hold.

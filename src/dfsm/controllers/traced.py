@@ -1,13 +1,25 @@
-"""Whether JAX is following a controller: checks of its numbers are made before."""
+"""What JAX follows of a controller: its numbers, which are checked before."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.core import Tracer
 
 
 def traced(tree: Any) -> bool:
     """Whether any number of a pytree is not known, because JAX traces a function of it."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def as_arrays(controller: Any) -> Any:
+    """The same controller with its numbers as arrays: others would be compiled in.
+
+    Names may stand among the numbers, in fields that nobody declared static; they stay.
+    """
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, controller
+    )

@@ -6,6 +6,13 @@ from typing import Any
 
 import equinox as eqx
 
+from dfsm.controllers.controller import require_controller
+
+
+def _controller(inner: Any) -> Any:
+    require_controller(inner, "inner")
+    return inner
+
 
 class Wrapper(eqx.Module):
     """Channels and interval of a `Controller` that are those of another.
@@ -14,9 +21,14 @@ class Wrapper(eqx.Module):
     ----------
     inner
         The controller.
+
+    Raises
+    ------
+    DfsmError
+        It is none.
     """
 
-    inner: Any
+    inner: Any = eqx.field(converter=_controller)
 
     @property
     def measurements(self) -> tuple[str, ...]:

@@ -110,6 +110,22 @@ class Bundle:
         return DfsmError(f"{path} is damaged: {what}; {self.cure} or restore the folder")
 
 
+def check_no_bundle(folder: Path) -> None:
+    """Refuse to write files of other kinds among those of a model or a solution.
+
+    Raises
+    ------
+    DfsmError
+        `folder` is one.
+    """
+    arrays = sorted(folder.glob("*.safetensors")) if (folder / MANIFEST).exists() else []
+    if arrays:
+        raise DfsmError(
+            f"{folder} holds {MANIFEST} and {arrays[0].name}, a model or a solution, which other "
+            "files would damage: choose another folder"
+        )
+
+
 def checksum(content: Mapping[str, Any]) -> str:
     """Digest of all that a mapping of JSON values says, however its JSON is laid out."""
     said = {k: v for k, v in content.items() if k != "checksum"}

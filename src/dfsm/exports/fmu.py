@@ -88,13 +88,18 @@ def write_fmu(
     Raises
     ------
     DfsmError
-        There is no such version or kind, the file cannot be written, a compiler fails, or a term is
-        a function with something in it that has no counterpart.
+        There is no such version or kind, the file has another suffix than .fmu or cannot be
+        written, a compiler fails, or a term is a function with something in it that has no
+        counterpart.
     """
     path = Path(path)
     require(fmi in (2, 3), "fmi", fmi, "2 or 3")
     require(kind is None or kind in KINDS, "kind", kind, " or ".join(KINDS))
     require(step is None or (np.isfinite(step) and step > 0), "step", step, "more than 0 s")
+    if path.suffix.lower() != ".fmu":
+        raise DfsmError(
+            f"{path} has the suffix '{path.suffix}', expected .fmu, by which other programs know it"
+        )
     check_file(path)
     code = to_c(model, path.stem)
     step = _safe_step(model, code.description["step"]) if step is None else float(step)

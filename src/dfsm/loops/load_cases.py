@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from dfsm.core.settings import require
+from dfsm.core.settings import require, require_list, require_number, shown
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
-from dfsm.numerics.fatigue import damage_by_exponent
+from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_by_exponent
 
 HOURS_PER_YEAR = 8766.0
 
@@ -80,6 +81,41 @@ def case_figures(run: Trajectory) -> dict[str, Figures]:
     return {name: Figures.of(run.time, run[name]) for name in run.names}
 
 
+def require_counted(exponent: float) -> None:
+    """Refuse a Wöhler exponent for which no loads are counted.
+
+    Raises
+    ------
+    DfsmError
+        Names those for which some are.
+    """
+    counted = ", ".join(f"{m:g}" for m in WOHLER_EXPONENTS)
+    require(exponent in WOHLER_EXPONENTS, "exponent", shown(exponent), f"one of {counted}")
+
+
+def require_weights(weights: Any, runs: int | None = None) -> None:
+    """Refuse shares of the time that are not numbers above 0, one per run.
+
+    Parameters
+    ----------
+    weights
+        What was given: anything.
+    runs
+        Number of the runs, where it is known.
+
+    Raises
+    ------
+    DfsmError
+        They are not.
+    """
+    expected = "one per run" if runs is None else f"one per run, {runs}"
+    require_list("weights", weights, expected)
+    many = len(weights) > 0 if runs is None else len(weights) == runs
+    require(many, "weights", shown(list(weights)), expected)
+    for weight in weights:
+        require_number("one of the weights", weight, "a number above 0", above=0)
+
+
 def weibull_weights(winds: Sequence[float], mean: float, shape: float = 2.0) -> list[float]:
     """Share of the time that each of several runs stands for, by its mean wind.
 
@@ -103,10 +139,14 @@ def weibull_weights(winds: Sequence[float], mean: float, shape: float = 2.0) -> 
     Raises
     ------
     DfsmError
-        Fewer than two different winds, or a mean or shape that is not positive.
+        A wind that is no number or negative, fewer than two different ones, or a mean or shape that
+        is not positive.
     """
-    require(mean > 0, "mean", mean, "m/s, more than 0")
-    require(shape > 0, "shape", shape, "more than 0")
+    require_number("mean", mean, "m/s, more than 0", above=0)
+    require_number("shape", shape, "more than 0", above=0)
+    require_list("winds", winds, "one for every run")
+    for wind in winds:
+        require_number("one of the winds", wind, "a number in m/s, at least 0", least=0)
     different = sorted({float(w) for w in winds})
     if len(different) < 2:
         raise DfsmError(

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dfsm.core.settings import require, settings_class
+from dfsm.core.settings import require, require_kind, require_number, settings_class
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.fatigue_slope import damage_with_slope
@@ -44,11 +44,13 @@ class Measure:
     reference: float | None = None
 
     def __post_init__(self) -> None:
+        require_kind("measure", self.measure, str, f"one of {', '.join(KINDS)}")
         if self.measure not in KINDS:
             raise DfsmError(
                 f"there is no measure '{self.measure}'; {near_matches(self.measure, KINDS)}"
             )
-        require(self.exponent >= 1, "exponent", self.exponent, "at least 1")
+        require_kind("channel", self.channel, str, "the name of a signal of the model")
+        require_number("exponent", self.exponent, "at least 1", least=1)
         needs = self.measure == "overshoot"
         require(
             (self.reference is not None) == needs,
@@ -56,7 +58,9 @@ class Measure:
             self.reference,
             "a value that is not 0" if needs else "none: only overshoot has one",
         )
-        require(self.reference != 0, f"reference of {self.label}", 0, "a value that is not 0")
+        name, expected = f"reference of {self.label}", "a value that is not 0"
+        require_number(name, self.reference, expected, optional=True)
+        require(self.reference != 0, name, 0, expected)
 
     @property
     def label(self) -> str:

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from dfsm.controllers.controller import INTERVAL
 from dfsm.controllers.state_space import StateFeedback, regulator_gain
 from dfsm.core.host import from_host
-from dfsm.core.settings import require
+from dfsm.core.settings import require, require_kind, require_number
 from dfsm.errors import DfsmError, missing
 from dfsm.models.dfsm import DFSM
 from dfsm.models.steady import SteadyState
@@ -55,9 +56,14 @@ def linear_quadratic(
     Raises
     ------
     DfsmError
-        A state or control that the model does not have, a deviation that is not positive, or no
-        such regulator.
+        A state or control that the model does not have, a deviation or an interval that is not
+        positive, or no such regulator.
     """
+    require_kind("model", model, DFSM, "a model: dfsm.load reads one, and a fit has one")
+    require_kind("point", point, SteadyState, "a steady state, as dfsm.steady_state finds it")
+    require_number("interval", interval, INTERVAL, above=0)
+    for where, told in (("states", states), ("integral", integral or {}), ("controls", controls)):
+        require_kind(where, told, Mapping, "the deviation that one accepts by name")
     s, integral = model.signals, dict(integral or {})
     names = [c.name for c in s.observed]
     for told, known, where in (
@@ -68,7 +74,10 @@ def linear_quadratic(
         if lost := [n for n in told if n not in known]:
             raise DfsmError(f"{where}: the model has {missing(lost, known)}")
         for name, value in told.items():
-            require(value > 0, f"{where}: {name}", value, "a deviation above 0")
+            # A state of which any deviation is accepted has no weight.
+            free = where == "states"
+            expected = "a deviation above 0"
+            require_number(f"{where}: {name}", value, expected, above=0, infinite=free)
     require(bool(controls), "controls", "empty", "at least one control")
     n, chosen = len(names), [s.names("controls").index(c) for c in controls]
     A, B, *_ = model.jacobians(point.states, point.controls, point.disturbances, point.parameters)

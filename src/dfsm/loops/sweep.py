@@ -10,22 +10,35 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dfsm.controllers.controller import Controller
+from dfsm.controllers.controller import Controller, require_controller, require_texts
 from dfsm.controllers.discon import Discon
 from dfsm.controllers.tunable import tunable
 from dfsm.core.drawing import Drawn
 from dfsm.core.files import json_value
-from dfsm.core.settings import require, settings_class
+from dfsm.core.settings import (
+    require,
+    require_kind,
+    require_list,
+    require_number,
+    settings_class,
+    shown,
+)
 from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
-from dfsm.loops.load_cases import HOURS_PER_YEAR, Figures, case_figures
+from dfsm.loops.load_cases import (
+    HOURS_PER_YEAR,
+    Figures,
+    case_figures,
+    require_counted,
+    require_weights,
+)
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.numerics.extremes import block_maxima, extrapolated, fit_gumbel
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, reduced_loops
-from dfsm.simulation.loop_cases import ClosedLoopSettings
+from dfsm.simulation.loop_cases import ClosedLoopSettings, checked_loops
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,10 +81,17 @@ class SweepSettings:
     years: float = 50.0
 
     def __post_init__(self) -> None:
-        require(self.block > 0, "block", self.block, "seconds, more than 0")
-        require(self.years > 0, "years", self.years, "more than 0")
+        for name in ("start", "stop"):
+            require_number(name, getattr(self, name), "seconds, or None", optional=True)
+        for name in ("power", "speed"):
+            require_kind(name, getattr(self, name), str | None, "the name of a signal, or None")
+        require_kind("loop", self.loop, ClosedLoopSettings, "dfsm.ClosedLoopSettings(…)")
+        require_number("block", self.block, "seconds, more than 0", above=0)
+        require_number("years", self.years, "more than 0", above=0)
         both = (self.speed is None) == (self.rated_speed is None)
         require(both, "rated_speed", self.rated_speed, "a value where speed is set, else none")
+        require_number("rated_speed", self.rated_speed, "more than 0", above=0, optional=True)
+        require_texts("extremes", self.extremes)
 
 
 @dataclass(frozen=True)
@@ -165,9 +185,15 @@ class Sweep(Drawn):
         ----------
         exponent
             Wöhler exponent of the damage-equivalent loads.
+
+        Raises
+        ------
+        DfsmError
+            One for which no loads were counted.
         """
         import pandas as pd
 
+        require_counted(exponent)
         lines = {}
         for swept in (self.recorded, *self.controllers):
             line: dict[str, float | None] = {
@@ -214,15 +240,21 @@ def sweep(
     Raises
     ------
     DfsmError
-        As `closed_loop`; or weights that are not one positive number per run, no controllers, or a
-        power or speed that the model does not have.
+        As `closed_loop`; or weights that are not one positive number per run, no controllers, one
+        without a name or with the record's, or a power or speed that the model does not have.
     """
+    require_kind("settings", settings, SweepSettings | None, "dfsm.SweepSettings(…)")
     settings = settings or SweepSettings()
+    require_kind("controllers", controllers, Mapping, "controllers by name, {'as it is': …}")
     if not controllers:
         raise DfsmError("no controllers were given to sweep over, at least one is needed")
-    weights = [1 / len(runs)] * len(runs) if weights is None else [float(w) for w in weights]
-    require(len(weights) == len(runs), "weights", weights, f"one per run, {len(runs)}")
-    require(min(weights) > 0, "weights", weights, "numbers above 0")
+    for name in controllers:
+        named = isinstance(name, str) and name not in ("", RECORDED)
+        require(named, "the name of a controller", shown(name), f"a text, and not '{RECORDED}'")
+    runs = checked_loops(model, runs, controllers, measurements)
+    weights = [1 / len(runs)] * len(runs) if weights is None else weights
+    require_weights(weights, len(runs))
+    weights = [float(w) for w in weights]
     s = model.signals
     units = {c.name: c.unit for c in (*s.states, *s.controls, *s.outputs)}
     named = [n for n in (settings.power, settings.speed, *settings.extremes) if n is not None]
@@ -267,16 +299,30 @@ def gain_grid(
     Raises
     ------
     DfsmError
-        There is no such gain, or one without values.
+        There is no such gain, or one without values, with one twice or that is no number.
     """
-    for name, values in gains.items():
-        require(len(values) > 0, f"values of {name}", "none", "at least one")
+    require_controller(controller)
+    require_kind("gains", gains, Mapping, "values by the name of a gain, {'kp': [1.0, 2.0]}")
+    require_texts("names of gains", list(gains))
+    texts = {name: _told_apart(name, values) for name, values in gains.items()}
     tuned, found = tunable(controller, gains, discon), {AS_IT_IS: controller}
-    for values in product(*gains.values()) if gains else ():
-        pairs = zip(gains, values, strict=True)
-        label = ", ".join(f"{name} {value:.6g}" for name, value in pairs)
-        found[label] = tuned.at(np.array(values, dtype=float))
+    for values in product(*(by_text.items() for by_text in texts.values())) if gains else ():
+        label = ", ".join(f"{n} {text}" for n, (text, _) in zip(gains, values, strict=True))
+        found[label] = tuned.at(np.array([value for _, value in values]))
     return found
+
+
+def _told_apart(name: str, values: Any) -> dict[str, float]:
+    """Values of a gain by what tells them apart: six digits, or all where six are too few."""
+    expected = f"a list of numbers, each once, as in {name}: [1.0, 2.0]"
+    require_list(f"values of {name}", values, expected)
+    require(len(values) > 0, f"values of {name}", "none", "at least one")
+    for value in values:
+        require_number(f"a value of {name}", value, expected)
+    numbers = [float(value) for value in values]
+    require(len(set(numbers)) == len(numbers), f"values of {name}", shown(values), expected)
+    short = {f"{value:.6g}": value for value in numbers}
+    return short if len(short) == len(numbers) else {f"{value!r}": value for value in numbers}
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 
 from dfsm.core.progress import track
-from dfsm.core.settings import require, settings_class
+from dfsm.core.settings import require, require_kind, require_number, settings_class, shown
 from dfsm.core.types import Array
 from dfsm.data.conversion import in_units_of
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, missing
-from dfsm.loops.truth import Truth, TruthCase, TruthEndedError
+from dfsm.loops.truth import FlownRuns, Truth, TruthCase, TruthEndedError
 from dfsm.loops.tuning import TuningTask
 from dfsm.loops.tuning_evaluate import Evaluator, Figured
 from dfsm.loops.tuning_search import FEASIBLE, Judged, Search
@@ -64,9 +65,10 @@ class TrustSettings:
     radius: float = 0.5
 
     def __post_init__(self) -> None:
-        require(self.flights >= 2, "flights", self.flights, "at least 2")
-        require(0 < self.tolerance < 1, "tolerance", self.tolerance, "between 0 and 1")
-        require(0 < self.radius <= 1, "radius", self.radius, "above 0, up to 1")
+        require_number("flights", self.flights, "a whole number, at least 2", least=2, whole=True)
+        require_number("tolerance", self.tolerance, "between 0 and 1", above=0)
+        require(self.tolerance < 1, "tolerance", self.tolerance, "between 0 and 1")
+        require_number("radius", self.radius, "above 0, up to 1", above=0, most=1)
 
 
 @dataclass(frozen=True)
@@ -229,6 +231,13 @@ def tune_with_truth(
     DfsmError
         As `tune`; or a run of the truth lacks a channel or a part of the scored time.
     """
+    require_kind("task", task, TuningTask, "dfsm.TuningTask(…)")
+    require_kind("settings", settings, TrustSettings | None, "dfsm.TrustSettings(…)")
+    what = "a truth, which has a method run(case), as dfsm.SystemTruth and dfsm.FlownRuns have"
+    flies = callable(getattr(truth, "run", None)) and not isinstance(truth, type)
+    require(flies, "truth", shown(truth), what)
+    if isinstance(truth, FlownRuns):
+        truth.check(task.runs)
     settings = settings or TrustSettings()
     low, high = task.problem.bounds
     first = np.clip(task.tuned.start, low, high)
@@ -320,6 +329,7 @@ def flown(task: TuningTask, truth: Truth, number: int, at: Array) -> Figured | N
 
 def _measured(task: TuningTask, k: int, run: Any) -> list[float]:
     case, s = task.evaluator.cases[k], task.model.signals
+    require_kind("what the truth's run returned", run, Trajectory, "a Trajectory")
     names = list(dict.fromkeys(m.channel for m in task.problem.measures))
     if lost := [n for n in names if n not in run]:
         raise DfsmError(f"{run.where}: the truth has {missing(lost, run.names)}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +19,8 @@ import numpy as np
 
 from dfsm.controllers.discon import Discon, write_discon
 from dfsm.core.host import from_host
+from dfsm.core.settings import require_kind
+from dfsm.data.apart import require_apart
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.readers import read
 from dfsm.data.trajectory import Channel, Trajectory
@@ -104,6 +107,8 @@ class SystemTruth:
         measurements: Mapping[str, str] | None = None,
         settings: ClosedLoopSettings | None = None,
     ) -> None:
+        require_kind("system", system, ODESystem, "a dfsm.ODESystem")
+        require_kind("settings", settings, ClosedLoopSettings | None, "dfsm.ClosedLoopSettings(…)")
         self.model = exact_model(system)
         self.measurements = measurements
         self.settings = settings or ClosedLoopSettings(start_up=0.0)
@@ -138,7 +143,19 @@ class FlownRuns:
     """
 
     def __init__(self, folder: str | Path) -> None:
+        require_kind("folder", folder, str | PathLike, "the path of a folder")
         self.folder = Path(folder)
+
+    def check(self, runs: Sequence[Trajectory]) -> None:
+        """Refuse runs of which two have one name: what is flown of one would stand for both.
+
+        Raises
+        ------
+        DfsmError
+            Names both.
+        """
+        targets = [self.folder / "flight_1" / run.name for run in runs]
+        require_apart(runs, targets, "be looked for as", "rename one of them")
 
     def prepare(self, cases: Sequence[TruthCase]) -> None:
         """Write what is to be flown.
@@ -146,8 +163,9 @@ class FlownRuns:
         Raises
         ------
         DfsmError
-            Runs are missing: names them, and says where they belong.
+            Runs are missing: names them, and says where they belong. Or two have one name.
         """
+        self.check([case.run for case in cases])
         place = self.folder / f"flight_{cases[0].flight}"
         place.mkdir(parents=True, exist_ok=True)
         if cases[0].discon is not None:

@@ -17,6 +17,7 @@ from dfsm.controllers.discon import Discon
 from dfsm.controllers.rosco import ROSCO
 from dfsm.controllers.tunable import Tunable, tunable
 from dfsm.core.progress import track
+from dfsm.core.settings import require_kind, require_number
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
@@ -25,6 +26,7 @@ from dfsm.loops.tuning_problem import TuneSettings, TuningProblem, check_problem
 from dfsm.loops.tuning_result import FrontPoint, Start, TuneStatus, TuningResult
 from dfsm.loops.tuning_search import FEASIBLE, Figures, Search, search_from, weighted
 from dfsm.models.dfsm import DFSM
+from dfsm.simulation.loop_cases import checked_loops
 
 # Shares of the first weight at the ends of a Pareto front: 0 and 1 would leave one term out.
 _LEAST_SHARE = 0.02
@@ -89,7 +91,11 @@ class TuningTask:
     settings: TuneSettings | None = None
 
     def __post_init__(self) -> None:
+        require_kind("problem", self.problem, TuningProblem, "dfsm.TuningProblem(…)")
+        require_kind("settings", self.settings, TuneSettings | None, "dfsm.TuneSettings(…)")
+        require_kind("discon", self.discon, Discon | None, "a deck, as dfsm.read_discon reads it")
         self.settings = self.settings or TuneSettings()
+        self.runs = checked_loops(self.model, self.runs, [self.controller], self.measurements)
         check_problem(self.problem, self.model, len(self.runs), self.settings)
         self.tuned: Tunable = tunable(self.controller, self.problem.parameters, self.discon)
         self.evaluator = Evaluator(
@@ -129,7 +135,14 @@ class TuningTask:
         ----------
         values
             Of the parameters, by name.
+
+        Raises
+        ------
+        DfsmError
+            One is missing.
         """
+        for name in self.tuned.names:
+            require_number(f"value of {name}", values.get(name), "a number")
         before = self.evaluator(self.tuned.start)
         search = self.search(before)
         theta = np.array([values[name] for name in self.tuned.names])

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.gains import with_numbers
+from dfsm.controllers.traced import as_arrays
 from dfsm.controllers.tunable import Tunable
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
@@ -33,6 +34,7 @@ from dfsm.simulation.loop import Path as LoopPath
 from dfsm.simulation.loop_cases import (
     ClosedLoopSettings,
     LoopCase,
+    checked_loops,
     enough_calls,
     padded,
     prepared_cases,
@@ -108,6 +110,7 @@ class Evaluator:
         loop: ClosedLoopSettings | None = None,
         measurements: Mapping[str, str] | None = None,
     ) -> None:
+        runs = checked_loops(model, runs, [tuned.controller], measurements, loop)
         if not is_compiled(tuned.controller):
             raise DfsmError(
                 f"{type(tuned.controller).__name__} is no equinox module, so JAX cannot "
@@ -122,7 +125,7 @@ class Evaluator:
         self._ready = staged(model)
         calls = enough_calls(*self.cases)
         self._drives = [padded(case, calls) for case in self.cases]
-        self._controller = jax.tree.map(jnp.asarray, tuned.controller)
+        self._controller = as_arrays(tuned.controller)
         self._known: dict[tuple[float, ...], Figured] = {}
         self._journal: Path | None = None
         # Whether a point that is known is not computed again.
@@ -180,7 +183,7 @@ class Evaluator:
     def loops(self, theta: Array) -> list[ClosedLoopRun]:
         """The closed loops themselves at a point."""
         controller = self.tuned.at(theta)
-        numbers = jax.tree.map(jnp.asarray, controller)
+        numbers = as_arrays(controller)
 
         def rolled(drive: Drive) -> LoopPath:
             path = roll_compiled(self._ready, self.wires, numbers, drive)

@@ -6,9 +6,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dfsm.core.settings import require, settings_class
+from dfsm.controllers.controller import require_texts
+from dfsm.core.settings import (
+    require,
+    require_kind,
+    require_list,
+    require_number,
+    settings_class,
+    shown,
+)
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, missing
+from dfsm.loops.load_cases import require_weights
 from dfsm.loops.measures import Measure
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.loop_cases import ClosedLoopSettings
@@ -33,13 +42,10 @@ class Goal(Measure):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            bool(np.isfinite(self.weight)) and self.weight != 0,
-            f"weight of {self.label}",
-            self.weight,
-            "a number that is not 0",
-        )
-        require(self.scale is None or self.scale > 0, "scale", self.scale, "more than 0")
+        name, expected = f"weight of {self.label}", "a number that is not 0"
+        require_number(name, self.weight, expected)
+        require(self.weight != 0, name, self.weight, expected)
+        require_number(f"scale of {self.label}", self.scale, "more than 0", above=0, optional=True)
 
 
 @settings_class
@@ -61,6 +67,9 @@ class Limit(Measure):
         super().__post_init__()
         one = (self.at_most is None) != (self.at_least is None)
         require(one, f"limit of {self.label}", "missing or double", "at_most or at_least")
+        for name in ("at_most", "at_least"):
+            what = f"{name} of {self.label}"
+            require_number(what, getattr(self, name), "a finite number", optional=True)
 
     @property
     def bound(self) -> float:
@@ -105,22 +114,33 @@ class TuningProblem:
     weights: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
+        bounds = "bounds by the name of a parameter, {'kp': (0.1, 2.0)}"
+        require_kind("parameters", self.parameters, Mapping, bounds)
+        require_texts("names of parameters", list(self.parameters))
         require(bool(self.parameters), "parameters", "empty", "at least one, with its bounds")
+        for name, terms, kind in (
+            ("objective", self.objective, Goal),
+            ("constraints", self.constraints, Limit),
+        ):
+            expected = f"a list of dfsm.{kind.__name__}(…)"
+            require_list(name, terms, expected)
+            for term in terms:
+                require_kind(f"a term of the {name}", term, kind, f"dfsm.{kind.__name__}(…)")
         require(bool(self.objective), "objective", "empty", "at least one term")
-        for name, (low, high) in self.parameters.items():
-            finite = bool(np.isfinite([low, high]).all())
-            require(
-                finite and low < high,
-                f"bounds of {name}",
-                (low, high),
-                "two numbers, the lower one first",
-            )
+        for name, pair in self.parameters.items():
+            told, expected = f"bounds of {name}", "two numbers, the lower one first"
+            require_list(told, pair, expected)
+            require(len(pair) == 2, told, shown(pair), expected)
+            for bound in pair:
+                require_number(f"one of the {told}", bound, expected)
+            low, high = pair
+            require(low < high, told, (low, high), expected)
             if name == "ps_percent":
                 require(low > 0 and high <= 1, f"bounds of {name}", (low, high), "shares up to 1")
             elif name in ("omega_pc", "zeta_pc", "omega_vs", "zeta_vs"):
                 require(low > 0, f"bounds of {name}", (low, high), "numbers above 0")
         if self.weights is not None:
-            require(min(self.weights) > 0, "weights", list(self.weights), "numbers above 0")
+            require_weights(self.weights)
 
     @property
     def measures(self) -> tuple[Measure, ...]:
@@ -166,11 +186,18 @@ class TuneSettings:
     pareto: int = 0
 
     def __post_init__(self) -> None:
-        require(self.starts >= 1, "starts", self.starts, "at least 1")
-        require(self.seed >= 0, "seed", self.seed, "0 or more")
-        require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
-        require(0 < self.tolerance < 1, "tolerance", self.tolerance, "between 0 and 1")
-        require(self.pareto == 0 or self.pareto >= 2, "pareto", self.pareto, "0, or at least 2")
+        for name in ("start", "stop"):
+            require_number(name, getattr(self, name), "seconds, or None", optional=True)
+        require_kind("loop", self.loop, ClosedLoopSettings, "dfsm.ClosedLoopSettings(…)")
+        require_number("starts", self.starts, "a whole number, at least 1", least=1, whole=True)
+        require_number("seed", self.seed, "a whole number, 0 or more", least=0, whole=True)
+        require_number(
+            "iterations", self.iterations, "a whole number, at least 1", least=1, whole=True
+        )
+        require_number("tolerance", self.tolerance, "between 0 and 1", above=0)
+        require(self.tolerance < 1, "tolerance", self.tolerance, "between 0 and 1")
+        require_number("pareto", self.pareto, "0, or a whole number from 2 on", least=0, whole=True)
+        require(self.pareto != 1, "pareto", self.pareto, "0, or a whole number from 2 on")
 
 
 def check_problem(problem: TuningProblem, model: DFSM, runs: int, settings: TuneSettings) -> None:
@@ -190,8 +217,7 @@ def check_problem(problem: TuningProblem, model: DFSM, runs: int, settings: Tune
             "by fitting the model with it)"
         )
     if problem.weights is not None:
-        count = len(problem.weights)
-        require(count == runs, "weights", list(problem.weights), f"one per run, {runs}")
+        require_weights(problem.weights, runs)
     if settings.pareto:
         count = len(problem.objective)
         require(count == 2, "terms of the objective", count, "two for a Pareto front")

@@ -18,11 +18,10 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar, overload
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
+from dfsm.controllers.traced import as_arrays
 from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
@@ -35,6 +34,7 @@ from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_comp
 from dfsm.simulation.loop_cases import (
     ClosedLoopSettings,
     LoopCase,
+    checked_loops,
     enough_calls,
     padded,
     prepared_cases,
@@ -166,8 +166,9 @@ def closed_loop(
     Raises
     ------
     DfsmError
-        The model lacks what the controller reads or sets, a channel is missing or not finite, a
-        run is not longer than the start-up, or a library refuses.
+        What was given is no model, run, controller or settings; the model lacks what the controller
+        reads or sets, a channel is missing or not finite, a run is not longer than the start-up, or
+        a library refuses.
 
     Warns
     -----
@@ -175,7 +176,7 @@ def closed_loop(
         A control stays as recorded, a loop ended early, or was outside the training range for part
         of the time.
     """
-    batch = [runs] if isinstance(runs, Trajectory) else list(runs)
+    batch = checked_loops(model, runs, [controller], measurements, settings)
     if kept := not_commanded(model, controller):
         warnings.warn(
             f"the controller does not set {', '.join(kept)}: recorded values are taken",
@@ -229,7 +230,7 @@ def closed_loops(
     begin = clock.perf_counter()
     batch = _Batch(model, runs, controllers, measurements, window, settings)
     results = batch.each(lambda run: run, watched=True)
-    wall = (clock.perf_counter() - begin) / max(1, len(runs) * len(controllers))
+    wall = (clock.perf_counter() - begin) / max(1, sum(map(len, results)))
     return [[replace(run, wall_time=wall) for run in of_one] for of_one in results]
 
 
@@ -271,13 +272,13 @@ class _Batch:
         self, reduce: Callable[[ClosedLoopRun], Reduced], watched: bool = False
     ) -> list[list[Reduced]]:
         """What `reduce` makes of every loop, per controller in the order of the runs."""
-        model, controllers, count = self.model, self.controllers, len(self.runs)
+        model, controllers = self.model, self.controllers
+        runs = checked_loops(model, self.runs, controllers, self.measurements, self.settings)
+        count = len(runs)
         settings = self.settings or ClosedLoopSettings()
         wires = [connect(model, controller, self.measurements) for controller in controllers]
         intervals = [float(c.interval) for c in controllers]
-        cases = {
-            i: prepared_cases(model, self.runs, i, self.window, settings) for i in set(intervals)
-        }
+        cases = {i: prepared_cases(model, runs, i, self.window, settings) for i in set(intervals)}
         ready, cores = staged(model), os.cpu_count() or 1
         pairs = zip(wires, controllers, strict=True)
         rollers = [_roller(ready, its, controller, watched) for its, controller in pairs]
@@ -313,8 +314,7 @@ def _roller(
             return not bool(((x >= low) & (x <= high)).all())
 
         return lambda case, _: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
-    # Numbers as arrays: others would be compiled in, and each controller compiled anew.
-    numbers = jax.tree.map(jnp.asarray, controller)
+    numbers = as_arrays(controller)
 
     def compiled(_: LoopCase, padded_drive: Callable[[], Drive]) -> Path:
         drive = padded_drive()

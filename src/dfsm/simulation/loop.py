@@ -195,8 +195,13 @@ def _failing(what: str) -> Iterator[None]:
         raise
     except Exception as error:
         first = str(error).partition("\n")[0]
+        # What JAX follows has no values yet that Python could decide by.
+        cure = isinstance(error, jax.errors.JAXTypeError) and (
+            ": write it with jax.numpy, and jnp.where in place of if"
+        )
         raise DfsmError(
             f"the controller's {what} fails with {type(error).__name__}: {printable(first)}"
+            f"{cure or ''}"
         ) from error
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import scipy
 
+from dfsm.controllers.controller import require_controller
 from dfsm.core.host import from_host
-from dfsm.core.settings import require, settings_class
+from dfsm.core.settings import require_kind, require_number, settings_class, shown
 from dfsm.core.types import Array
 from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
@@ -46,8 +48,8 @@ class ClosedLoopSettings:
     step: float | None = None
 
     def __post_init__(self) -> None:
-        require(self.start_up >= 0, "start_up", self.start_up, "seconds, at least 0")
-        require(self.step is None or self.step > 0, "step", self.step, "seconds, more than 0")
+        require_number("start_up", self.start_up, "seconds, at least 0", least=0)
+        require_number("step", self.step, "seconds, more than 0", above=0, optional=True)
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,57 @@ class LoopCase:
         return np.stack([np.interp(at, mesh, column) for column in values.T], axis=1)
 
 
+def checked_loops(
+    model: Any,
+    runs: Any,
+    controllers: Sequence[Any] | Mapping[str, Any],
+    measurements: Any = None,
+    settings: Any = None,
+) -> list[Trajectory]:
+    """Refuse what no loops can be closed with, before anything is computed.
+
+    Parameters
+    ----------
+    model, runs, measurements, settings
+        As for `closed_loop`; one run alone will do.
+    controllers
+        Any number, by name if they have some.
+
+    Returns
+    -------
+    list of Trajectory
+        The runs.
+
+    Raises
+    ------
+    DfsmError
+        One of them is not what it should be, or there are no runs.
+    """
+    require_kind("model", model, DFSM, "a model: dfsm.load reads one, and a fit has one")
+    of_runs = "runs: dfsm.read reads one, dfsm.read_all several"
+    if isinstance(runs, str | Mapping):
+        require_kind("runs", runs, Trajectory, of_runs)
+    require_kind("runs", runs, Trajectory | Iterable, of_runs)
+    batch: list[Any] = [runs] if isinstance(runs, Trajectory) else list(runs)
+    if not batch:
+        raise DfsmError("no runs were given to close the loop over")
+    for run in batch:
+        require_kind("one of the runs", run, Trajectory, of_runs)
+    by_name = controllers if isinstance(controllers, Mapping) else None
+    for one in controllers:
+        if by_name is None:
+            require_controller(one)
+        else:
+            require_controller(by_name[one], f"controller {shown(one)}")
+    stand_ins = "names of the model's signals by the names of measurements"
+    require_kind("measurements", measurements, Mapping | None, stand_ins)
+    for name, signal in (measurements or {}).items():
+        require_kind("a name among measurements", name, str, "a text")
+        require_kind(f"measurements: {name}", signal, str, "the name of a signal of the model")
+    require_kind("settings", settings, ClosedLoopSettings | None, "dfsm.ClosedLoopSettings(…)")
+    return batch
+
+
 def prepared_cases(
     model: DFSM,
     runs: Sequence[Trajectory],
@@ -102,10 +155,14 @@ def prepared_cases(
     Raises
     ------
     DfsmError
-        No runs, a channel that is missing or not finite, or a run not longer than the start-up.
+        A channel that is missing or not finite, a window that holds nothing of a run, or a run not
+        longer than the start-up.
     """
-    if not runs:
-        raise DfsmError("no runs were given to close the loop over")
+    for name, end in zip(("start", "stop"), window, strict=True):
+        require_number(name, end, "seconds, or None for that end of the run", optional=True)
+    start, stop = window
+    if start is not None and stop is not None and start >= stop:
+        raise DfsmError(f"the time window goes from {start:g} s to {stop:g} s: swap the two")
     s = model.signals
     cases = []
     for run in all_completed(list(runs), s):
@@ -123,7 +180,18 @@ def _case(
     settings: ClosedLoopSettings,
 ) -> LoopCase:
     s, (start, stop) = model.signals, window
-    first = float(run.time[0]) if start is None else start - settings.start_up
+    first, last = float(run.time[0]), float(run.time[-1])
+    for name, end, outside in (
+        ("start", start, start is not None and start >= last),
+        ("stop", stop, stop is not None and stop <= first),
+    ):
+        if outside:
+            raise DfsmError(
+                f"{run.where}: {name} is {end:g} s, expected a time within the run, from {first:g} "
+                f"to {last:g} s: choose another, or leave the run out"
+            )
+    if start is not None:
+        first = start - settings.start_up
     part = run.window(first, stop)
     begins, ends = float(part.time[0]), float(part.time[-1])
     calls = int(np.floor((ends - begins) / interval * (1 + 1e-9)))

@@ -15,7 +15,7 @@ from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.loop import Drive, Path, roll
-from dfsm.simulation.loop_cases import ClosedLoopSettings, padded, prepared_cases
+from dfsm.simulation.loop_cases import ClosedLoopSettings, checked_loops, padded, prepared_cases
 from dfsm.simulation.wires import Wires, connect
 
 
@@ -87,6 +87,7 @@ def prepare_loop(
     DfsmError
         As `closed_loop`; or the runs differ in their sampling.
     """
+    runs = checked_loops(model, runs, [controller], measurements, settings)
     settings = settings or ClosedLoopSettings()
     wires = connect(model, controller, measurements)
     cases = prepared_cases(model, runs, controller.interval, (start, stop), settings)

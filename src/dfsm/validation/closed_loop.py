@@ -22,7 +22,7 @@ from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.recorded import recorded_states
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
-from dfsm.simulation.loop_cases import ClosedLoopSettings
+from dfsm.simulation.loop_cases import ClosedLoopSettings, checked_loops
 from dfsm.simulation.simulate import Simulation, Status, simulate
 from dfsm.validation.results import ChannelError, ChannelStatistics
 from dfsm.validation.validate import all_statistics, frequency_bands, recorded_channels
@@ -198,8 +198,9 @@ def validate_closed_loop(
     DfsmError
         As `closed_loop`, or a run lacks a channel to compare with.
     """
+    runs = checked_loops(model, runs, [controller], measurements, settings)
     s = model.signals
-    runs = all_completed(list(runs), s)
+    runs = all_completed(runs, s)
     for run in runs:
         run.columns(s.recorded)
     with hushed():
