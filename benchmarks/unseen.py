@@ -40,17 +40,20 @@ def run() -> dict[str, Any]:
     tests = {label: turbine.with_rings(runs) for label, runs in tests.items()}
     plain = uncorrected()
     bare = {"corrective": dfsm.NoCorrection(), "corrected": None, "outputs": ()}
-    whole = replace(rotor.settings(), **bare)
+    still = replace(rotor.settings(ahead=()), **bare)
 
     def with_rotor(settings: dfsm.FitSettings, **changes: Any) -> dfsm.FitSettings:
         terms = (replace(term, **changes) for term in settings.terms)
         return replace(settings, **bare, terms=tuple(terms))
 
     steady = {"induction": "steady", "uncertainty": 0.0}
-    table = with_rotor(rotor.settings(()), memory="speed", **steady)
-    rings = with_rotor(whole, memory="speed", **steady)
-    through_wind = with_rotor(whole, **steady)
-    factors = with_rotor(whole, induction="steady")
+    table = with_rotor(rotor.settings((), ()), memory="speed", **steady)
+    rings = with_rotor(still, memory="speed", **steady)
+    through_wind = with_rotor(still, **steady)
+    factors = with_rotor(still, induction="steady")
+    ahead = {feature.name for feature in rotor.AHEAD}
+    inputs = tuple(n for n in rotor.REFINEMENT.latent_inputs or () if n not in ahead)
+    by_wind = replace(rotor.REFINEMENT, latent_inputs=inputs)
     by_pitch = replace(scheduled.REFINEMENT, network=0)
     results = {}
     for name, settings, refinement in (
@@ -59,8 +62,9 @@ def run() -> dict[str, Any]:
         ("and the wind over six rings", rings, by_pitch),
         ("and latent states that change the wind at the rotor", through_wind, by_pitch),
         ("and smooth factors of the table", factors, by_pitch),
-        ("and latent states of wind and waves alone", factors, rotor.REFINEMENT),
-        ("and induced velocities that lag", whole, rotor.REFINEMENT),
+        ("and latent states of wind and waves alone", factors, by_wind),
+        ("and induced velocities that lag", still, by_wind),
+        ("and the waves some seconds ahead", replace(rotor.settings(), **bare), rotor.REFINEMENT),
     ):
         begin = time.perf_counter()
         with warnings.catch_warnings():

@@ -3,7 +3,8 @@
 The table of the rotor's thrust and torque is part of the linear fit; wind and blade pitch reach it
 relative to the moving hub, and the induced velocity lags behind. What runs add is small and the
 same at all winds. From the wind field come averages over rings of the rotor, of which refinement
-learns how much each counts. Trained at 6, 12 and 18 m/s, tested at 8, 10, 14 and 16 m/s, too.
+learns how much each counts. Waves act on the hull before they arrive where their elevation is told.
+Trained at 6, 12 and 18 m/s, tested at 8, 10, 14 and 16 m/s, too.
 
     python examples/iea15/rotor_model.py [--output out/]
 """
@@ -35,6 +36,8 @@ from turbine_runs import (
 )
 
 RINGS = ("U_r015", "U_r036", "U_r057", "U_r078", "U_r099", "U_r116", "U_cubic")
+# The elevation so many seconds ahead: waves of 7 s need four to go from one column to the next.
+AHEAD = tuple(dfsm.Feature(source="Wave1Elev", kind="lead", seconds=s) for s in (2.0, 4.0, 6.0))
 # What moves the platform besides the rotor, by the equation of motion in pitch.
 HYDRODYNAMICS = (
     *("PtfmPitch", "PtfmPitch_dot", "Wave1Elev", "Wave1Elev_dot"),
@@ -61,11 +64,14 @@ def rotor(rings: Sequence[str] = RINGS) -> dfsm.Rotor:
     )
 
 
-def settings(rings: Sequence[str] = RINGS) -> dfsm.FitSettings:
-    """Signals and structure. Wave forces need the elevation's rate.
+def settings(
+    rings: Sequence[str] = RINGS, ahead: Sequence[dfsm.Feature] = AHEAD
+) -> dfsm.FitSettings:
+    """Signals and structure. Wave forces need the elevation's rate, and what it will be.
 
     Only outputs are corrected: what controllers and optimizers do with a model, no run did.
     """
+    hydrodynamics = (*HYDRODYNAMICS, *(feature.name for feature in ahead))
     excess = (dfsm.Feature(source=r, kind="difference", less="RotWind") for r in rings)
     return dfsm.FitSettings(
         states=(
@@ -74,14 +80,14 @@ def settings(rings: Sequence[str] = RINGS) -> dfsm.FitSettings:
         ),
         controls=CONTROLS,
         disturbances=DISTURBANCES,
-        features=(dfsm.Feature(source="Wave1Elev"), *excess),
+        features=(dfsm.Feature(source="Wave1Elev"), *ahead, *excess),
         outputs=OUTPUTS,
         terms=(rotor(rings),),
         linear=dfsm.LPV(
             schedule="RotWind",
             points=9,
             margin=0.01,
-            only={"PtfmPitch": ("rotor.thrust", "rotor.torque", *HYDRODYNAMICS)},
+            only={"PtfmPitch": ("rotor.thrust", "rotor.torque", *hydrodynamics)},
         ),
         corrective=dfsm.RBF(),
         corrected=OUTPUTS,
@@ -101,6 +107,7 @@ REFINEMENT = dfsm.RefineSettings(
     latent_inputs=(
         *("RotWind", "RotShearV", "RotShearH", "Wave1Elev", "Wave1Elev_dot"),
         *(f"{ring}-RotWind" for ring in RINGS),
+        *(feature.name for feature in AHEAD),
     ),
     decay=3.0,
 )
