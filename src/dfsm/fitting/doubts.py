@@ -71,12 +71,15 @@ class Doubts:
         The same for verdicts.
     outdated
         Whether rollouts have changed the coefficients since.
+    unexplained
+        RMS that the linear fit leaves of its worst row, relative to the row's standard deviation.
     """
 
     notes: tuple[str, ...]
     errors: Array
     reasons: tuple[Reason, ...] = ()
     outdated: bool = False
+    unexplained: float = 1.0
 
     @property
     def cured_by_margin(self) -> bool:
@@ -117,10 +120,13 @@ def doubts(
                 Reason(name, "coarse", "its samples are too far apart", "a finer record")
             )
     laws: dict[int, Law] = {}
+    worst = 0.0
     names, driving = samples.linear_names, len(samples.signals.driving)
     for place, row in enumerate(r for r in range(len(mean)) if r not in kinematic):
         name, target = samples.derivative_names[row][0], samples.derivatives[:, row]
         errors[row] = standard_errors(even, even_left[:, place], parts)
+        spread = max(float(std_over(target, samples.weights)), np.finfo(float).tiny)
+        worst = max(worst, float(std_over(left[:, place], samples.weights)) / spread)
         held = {column for r, column in fit.model.known if r == row}
         errors[row, list(held)] = 0.0
         for text in _noise(name, samples, inputs, target, mean[row]):
@@ -161,7 +167,7 @@ def doubts(
                         _EXCITE,
                     )
                 )
-    return Doubts(tuple(notes), errors, tuple(reasons))
+    return Doubts(tuple(notes), errors, tuple(reasons), unexplained=worst)
 
 
 def memory_doubt(model: DFSM) -> list[str]:
