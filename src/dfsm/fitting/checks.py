@@ -13,7 +13,7 @@ from dfsm.data.dataset import Dataset
 from dfsm.errors import DfsmError, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.doubts import Doubts
-from dfsm.fitting.records import data_warnings, held_records
+from dfsm.fitting.records import data_warnings
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.verdicts import Evidence, verdicts
@@ -39,7 +39,7 @@ def check(
     Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
     The last of what is returned are growths and verdicts, for the record.
     """
-    held = held_records(data, settings, samples)
+    held = doubt.held
     notes = data_warnings(data, settings, samples) + list(held.values())
     if not all(map(np.all, _finite(model, samples))):
         raise DfsmError(
