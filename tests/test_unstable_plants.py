@@ -61,3 +61,27 @@ def test_a_growth_that_the_residual_may_have_made_is_not_called_the_plants():
     assert not any("what the plant does" in note for note in notes)
     inputs = replace(SETTINGS, inputs="linear")
     assert "open loop" not in told([balanced(k) for k in range(3)], inputs)[0]["text"]
+
+
+@pytest.mark.parametrize("recorded", [("u",), ("u", "wanted")])
+def test_what_a_digital_controller_holds_is_told_however_smooth(recorded):
+    rng, time = np.random.default_rng(4), np.arange(1500) * 0.1
+    stable = np.array([[0.0, 1.0, 0.0], [-0.5, -0.2, 0.8], [0.0, 0.0, 0.0]])
+    wide = expm(stable * 0.1)
+    wanted = np.repeat(rng.uniform(0, 1, 15), 100)
+    x, total, rows = np.zeros(2), 0.0, []
+    for k in range(len(time)):
+        total += 0.03 * (wanted[k] - x[0])
+        u = 2 * (wanted[k] - x[0]) + total - 0.5 * x[1]
+        rows.append([*x, u, wanted[k]])
+        x = wide[:2, :2] @ x + wide[:2, 2] * u
+    channels = tuple(Channel(n) for n in ("th", "om", "u", "wanted"))
+    run = Trajectory(time, np.array(rows), channels)
+    settings = replace(SETTINGS, inputs=None, disturbances=recorded[1:])
+    verdict, notes = told([run], settings)
+    assert any("set inputs: {u: hold}" in note for note in notes)
+    assert verdict["verdict"] == "for trends only"
+    model = fit([run], replace(settings, inputs={"u": "hold"})).model
+    row = dict(zip(model.signals.order.names, model.f.coefficients[0, 1], strict=True))
+    found = [float(row[n]) for n in ("u", "th", "th_dot")]
+    assert found == pytest.approx([0.8, -0.5, -0.2], abs=1e-3)

@@ -175,6 +175,12 @@ def doubts(
                 Reason(name, "rough", "an input is too rough for its mesh", "what is told of it")
             )
         if late is not None and series is not None:
+            # By a sample, which looks like holding for half of one on either side.
+            held_channels = {
+                n: text
+                for n, text in held_channels.items()
+                if n not in {names[c] for c in late.seconds}
+            }
             notes.append(late_note(name, names, late, series.unexplained))
             # A delay that costs little is no reason against the model.
             which = " and ".join(f"'{names[c]}'" for c in late.seconds)

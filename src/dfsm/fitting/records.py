@@ -64,11 +64,18 @@ def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict
     chosen = settings.inputs or {}
     if isinstance(chosen, str) or samples.weights is not None:
         return {}
-    names, states = samples.signals.driving, [s.name for s in settings.states]
+    names = samples.signals.driving
+    states = [n for s in settings.states for n in (s.name, s.rate) if n is not None]
+    complete = all(s.order == 1 or s.rate is not None for s in settings.states)
     runs = [run.window(known_from(run, settings), settings.stop) for run in data]
-    found = held_unseen(
-        lambda: ((run.select(states).values, run.select(names).values) for run in runs)
-    )
     kinds = samples.signals.between
-    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in chosen]
+    known = [k for k, kind in enumerate(kinds) if kind == "hold"]
+    found = held_unseen(
+        lambda: ((run.select(states).values, run.select(names).values) for run in runs),
+        complete,
+        known,
+    )
+    # A feature is not given out by anybody: it goes between samples as what it is made of lets it.
+    named = {*chosen, *(f.name for f in settings.features)}
+    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in named]
     return {name: held_note(name) for name in lines}
