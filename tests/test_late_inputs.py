@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from dfsm import Channel, DfsmWarning, Feature, FitSettings, StateSpec, Trajectory, fit
+from dfsm import (
+    Channel,
+    DfsmWarning,
+    Feature,
+    FitSettings,
+    StateSpec,
+    Trajectory,
+    fit,
+    validate,
+)
 from dfsm.fitting.corrective import NoCorrection
 
 STEP, FINE = 0.5, 40
@@ -89,3 +98,15 @@ def test_a_row_that_wants_an_order_more_is_not_called_late_nor_fed_back(lag):
     row = np.asarray(fit(runs, second).model.f.coefficients[0, 1])
     want = np.array([1, 0.5, 0.4, -0.2]) / lag
     assert row == pytest.approx([*want, -0.2 - 1 / lag], abs=0.02)
+
+
+def test_a_comparison_leaves_out_what_acted_before_the_record():
+    delays = tuple(Feature(source=n, kind="delay", seconds=6.0) for n in "ab")
+    runs = [recorded(k, (6.0, 6.0)) for k in range(4)]
+    model = fit(runs[:3], replace(SETTINGS, features=delays)).model
+    # The hidden past of a short run is a fifth of it.
+    judged = validate(model, [runs[3].window(100, 130)])
+    assert judged.runs[0].recorded.time[0] == 106
+    assert judged.runs[0].models["multi-fidelity"].errors["x"].nrmse < 0.01
+    assert any("compared from 106 s on" in text for text in judged.warnings)
+    assert validate(model, runs[3:], start=50).runs[0].recorded.time[0] == 50

@@ -155,6 +155,35 @@ def unknown_until(features: Iterable[Feature]) -> float:
     return max(late.values(), default=0.0)
 
 
+def known_from(run: Trajectory, features: Iterable[Feature], start: float | None) -> float | None:
+    """Where a fit or a comparison starts: not where a delayed input is from before the record.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    features
+        Of the model.
+    start
+        Time in s that is asked for; None for the whole run.
+
+    Raises
+    ------
+    DfsmError
+        The run is no longer than what is unknown.
+    """
+    unknown = unknown_until(features)
+    if not unknown:
+        return start
+    first = float(run.time[0]) + unknown
+    if first >= run.time[-1]:
+        raise DfsmError(
+            f"{run.where} lasts {run.duration:g} s, and a delayed input is not known for the first "
+            f"{unknown:g} s of it: leave the run out, or shorten the delay"
+        )
+    return first if start is None else max(first, start)
+
+
 def acting_late(features: Iterable[Feature], controls: Iterable[str]) -> dict[str, str]:
     """Features that hold what a control did before, each with that control.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dfsm.data.dataset import Dataset
+from dfsm.data.features import known_from
 from dfsm.data.info import gap_warning
 from dfsm.data.signs import held_interval, wrap_notes
 from dfsm.data.stuck import stuck_notes
 from dfsm.data.wind import wind_warning
 from dfsm.fitting.held_inputs import held_note, held_unseen
-from dfsm.fitting.samples import Samples, known_from
+from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 
 
@@ -67,7 +68,10 @@ def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict
     names = samples.signals.driving
     states = [n for s in settings.states for n in (s.name, s.rate) if n is not None]
     complete = all(s.order == 1 or s.rate is not None for s in settings.states)
-    runs = [run.window(known_from(run, settings), settings.stop) for run in data]
+    runs = [
+        run.window(known_from(run, settings.features, settings.start), settings.stop)
+        for run in data
+    ]
     kinds = samples.signals.between
     known = [k for k, kind in enumerate(kinds) if kind == "hold"]
     found = held_unseen(

@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from dfsm.data.dataset import Dataset
+from dfsm.data.features import known_from
 from dfsm.errors import hushed
-from dfsm.fitting.samples import Samples, known_from
+from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.hidden import latents_along
@@ -29,7 +30,10 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSett
         return replace(samples, terms=model.terms)
     paths = []
     for run in data:
-        inside = np.isin(run.time, run.window(known_from(run, settings), settings.stop).time)
+        inside = np.isin(
+            run.time,
+            run.window(known_from(run, settings.features, settings.start), settings.stop).time,
+        )
         paths.append(latents_along(model, run)[inside])
     s = model.signals
     if s.telling:
@@ -71,6 +75,8 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
             rollouts = simulate(model, data[some], start=settings.start, stop=settings.stop)
         for run, rollout, rows in zip(data[some], rollouts, parts[some], strict=True):
             if rollout.status is Status.COMPLETED:
-                inside = rollout.trajectory.window(known_from(run, settings), settings.stop)
+                inside = rollout.trajectory.window(
+                    known_from(run, settings.features, settings.start), settings.stop
+                )
                 inputs[rows, columns] = inside.select(names).values
     return replace(samples, inputs=inputs)

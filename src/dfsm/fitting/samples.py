@@ -27,7 +27,7 @@ from dfsm.data.derivatives import (
     state_names,
     state_units,
 )
-from dfsm.data.features import unknown_until
+from dfsm.data.features import known_from
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
 from dfsm.data.suspects import screened
@@ -251,12 +251,14 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         extracted = differentiate(run, settings.states, settings.derivatives, breaks)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
-        inside = whole.window(known_from(whole_run, settings), settings.stop)
+        inside = whole.window(
+            known_from(whole_run, settings.features, settings.start), settings.stop
+        )
         rows = np.isin(whole.time, inside.time)
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
-        seen = run.window(known_from(whole_run, settings), settings.stop)
+        seen = run.window(known_from(whole_run, settings.features, settings.start), settings.stop)
         times.append(seen.time)
         recorded.append(_columns(seen, settings.outputs))
         place = slice(begin, begin := begin + len(times[-1]))
@@ -302,7 +304,7 @@ def _places(data: Dataset, settings: FitSettings) -> dict[str, Array]:
     count, azimuth = 0, settings.azimuth
     for run in data:
         used = lead_in(run, settings.start, settings.derivatives)
-        count += len(used.window(known_from(run, settings), settings.stop))
+        count += len(used.window(known_from(run, settings.features, settings.start), settings.stop))
     driving = len(settings.controls) + len(settings.driving) + len(settings.parameters)
     states = len(state_names(settings.states))
     blades = 0 if azimuth is None or azimuth.rings else 2
@@ -321,22 +323,11 @@ def _rough(data: Dataset, signals: SignalTable, settings: FitSettings) -> tuple[
     """Names of the inputs that are joined by lines and turn at nearly every sample."""
     driving = [run.select(signals.driving) for run in data]
     pairs = zip(data, driving, strict=True)
-    runs = [few.window(known_from(run, settings), settings.stop) for run, few in pairs]
+    runs = [
+        few.window(known_from(run, settings.features, settings.start), settings.stop)
+        for run, few in pairs
+    ]
     return rough_ones(runs, signals.driving, signals.between)
-
-
-def known_from(run: Trajectory, settings: FitSettings) -> float | None:
-    """Where a fit starts: not where a delayed input is still that from before the record."""
-    unknown = unknown_until(settings.features)
-    if not unknown:
-        return settings.start
-    first = float(run.time[0]) + unknown
-    if first >= run.time[-1]:
-        raise DfsmError(
-            f"{run.where} lasts {run.duration:g} s, and a delayed input is not known for the first "
-            f"{unknown:g} s of it: leave the run out, or shorten the delay"
-        )
-    return first if settings.start is None else max(first, settings.start)
 
 
 def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
