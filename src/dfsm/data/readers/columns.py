@@ -89,24 +89,47 @@ def _numbers_rows(values: Array) -> bool:
     return bool(whole and (np.diff(values) > 0).all())
 
 
-def time_column(path: Path, channels: list[Channel], names: tuple[str, ...] = TIME_NAMES) -> int:
+def time_column(
+    path: Path,
+    channels: list[Channel],
+    names: tuple[str, ...] = TIME_NAMES,
+    converts: bool = False,
+) -> int:
     """Return the column that holds the time.
+
+    Parameters
+    ----------
+    path
+        The file.
+    channels
+        Of all columns.
+    names
+        What a time is called, in small letters.
+    converts
+        Whether the reader takes a time in another unit to s, see `seconds_per`.
 
     Raises
     ------
     DfsmError
-        There is none, or its unit is not s.
+        There is none, or its unit is not s and none that is converted.
     """
     called = [channel.name.lower() for channel in channels]
     at = next((i for kind in (names, ALSO_TIME) for i, n in enumerate(called) if n in kind), None)
     if at is None:
         raise no_time(path, channels)
-    if channels[at].unit.lower() not in SECONDS:
+    if not (converts and seconds_per(channels[at].unit)) and (
+        channels[at].unit.lower() not in SECONDS
+    ):
         raise DfsmError(
             f"{path}: its time '{channels[at].name}' is in '{channels[at].unit}', expected s: "
             "convert it"
         )
     return at
+
+
+def seconds_per(unit: str) -> float | None:
+    """What a unit of time is in s; None for one of something else."""
+    return 1.0 if unit.lower() in SECONDS else factor(unit, "s")
 
 
 def no_time(path: Path, channels: Sequence[Channel]) -> DfsmError:

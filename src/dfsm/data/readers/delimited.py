@@ -24,6 +24,7 @@ from dfsm.data.readers.columns import (
     kept_columns,
     no_time,
     rate_step,
+    seconds_per,
     since_1970,
     time_column,
     uniform_times,
@@ -109,6 +110,12 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
             told, what = counted
             name = channels[time].name
             note = f"'{name}' counts {what} since 1970: times are seconds since the first"
+        elif table.stamps is None and (scale := seconds_per(channels[time].unit)) not in (
+            1.0,
+            None,
+        ):
+            told = told * scale
+            note = f"'{channels[time].name}' is in {channels[time].unit}: times are converted to s"
     keep, notes = kept_columns(path, channels, columns, rate)
     if time is not None:
         keep, notes = without_more_times(path, channels, columns, time, (keep, notes))
@@ -214,7 +221,7 @@ def _time(path: Path, channels: list[Channel], rows: list[Row]) -> int | None:
             if channel.name.lower() in names and i < len(first) and is_stamp(first[i]):
                 return i
     if any(c.name.lower() in (*TIME_NAMES, *ALSO_TIME) for c in channels):
-        return time_column(path, channels)
+        return time_column(path, channels, converts=True)
     for i, channel in enumerate(channels):
         if channel.name.lower() in _STAMP_NAMES and i < len(first):
             counts = np.array([np.nan if (value := number(first[i])) is None else value])
