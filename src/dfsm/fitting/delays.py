@@ -93,9 +93,9 @@ def late_inputs(residuals: Residuals, columns: Sequence[int]) -> LateInputs | No
     if search is None or not moving:
         return None
     grid, shortest, share, rows = search
-    alike = min(grid, key=lambda lag: rows.left(dict.fromkeys(moving, lag)))
+    alike = min(grid.tolist(), key=lambda lag: rows.left(dict.fromkeys(moving, float(lag))))
     # From none late, and from all late alike: of two that are, none alone explains much.
-    starts = [{}] if len(moving) == 1 else [{}, dict.fromkeys(moving, float(alike))]
+    starts = [{}] if len(moving) == 1 else [{}, dict.fromkeys(moving, alike)]
     found = [_in_turn(rows, grid, moving, start) for start in starts]
     lags = _needed(rows, min(found, key=rows.left), (shortest, float(grid[-1])))
     left = rows.left(lags)
@@ -172,9 +172,9 @@ def _in_turn(
             lags[first] = tried[first][1]
         if lags == before:
             break
+    places = {c: int(np.searchsorted(grid, lags[c])) for c in columns}
     for _ in range(2):
-        for column in columns:
-            k = int(np.searchsorted(grid, lags[column]))
+        for column, k in places.items():
             around = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 13)
             lags[column] = best(column, around)[1]
     return lags
