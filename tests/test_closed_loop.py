@@ -290,3 +290,29 @@ def test_a_pi_controller_takes_over_without_a_jump_and_holds_its_setpoint(model)
     found = quietly(model, run, pi, settings=AT_ONCE).trajectory
     assert found["u0"][0] == pytest.approx(1.5)
     assert found["q"][-1] == pytest.approx(0.9, abs=1e-5)
+
+
+class _Thermostat(Feedback):
+    """Sets a heater to 20 °C and two degrees more for each that is missing to 30 °C."""
+
+    unit: tuple[float, float] = eqx.field(static=True, default=(1.0, 0.0))
+
+    def step(self, state: Any, measurements: Any, time: Any) -> Any:
+        scale, zero = self.unit
+        return state, jnp.array([(80.0 - 2 * (measurements[0] - zero) / scale) * scale + zero])
+
+
+@pytest.mark.parametrize("host", [False, True])
+def test_temperatures_keep_the_zero_of_their_unit_in_a_loop(host):
+    # T' = -0.05 (T - u0), both in degC: T settles where T = u0 = 20 + 2 (30 - T).
+    pulls = (np.array([[-0.05]]), np.array([[0.05, 0.0]]))
+    heated = linear_model(*pulls, names=["T"], units=["degC"])
+    controls = (replace(heated.signals.controls[0], unit="degC"), heated.signals.controls[1])
+    heated = replace(heated, signals=replace(heated.signals, controls=controls))
+    run = run_of(heated, np.arange(0, 200.1, 0.5), x0=(25.0,), commanded=25.0)
+    for name, unit in (("degC", (1.0, 0.0)), ("K", (1.0, 273.15)), ("degF", (1.8, 32.0))):
+        units = {"measurement_units": (name,), "command_units": (name,)}
+        law: Any = replace(_Thermostat(jnp.zeros(1)), measurements=("T",), unit=unit, **units)
+        found = quietly(heated, run, OnHost(law) if host else law, settings=AT_ONCE).trajectory
+        assert found["T"][-1] == pytest.approx(80 / 3, abs=1e-4)
+        assert found["u0"][-1] == pytest.approx(80 / 3, abs=1e-3)

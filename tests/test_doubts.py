@@ -263,6 +263,20 @@ def test_stray_samples_and_runs_in_another_unit():
     screened([run(time, x=pulse)], ["x"], "refuse", window, DerivativeSettings())
 
 
+def test_a_run_that_is_small_as_a_whole_is_no_run_in_another_unit():
+    time, rng = np.arange(100.0), np.random.default_rng(9)
+    pairs = np.sin(2 * np.pi / 20 * time + rng.uniform(0, 6, (3, 2, 1)))
+    for factor in (1000.0, 57.3, 9.55):
+        small = [run(time, x=x, u=u * 1e3, p=x * u) for x, u in pairs]
+        x, u = pairs[0] / factor
+        small[0] = run(time, x=x, u=u * 1e3, p=x * u)
+        screened(small, ["x", "u", "p"], "refuse", (None, None), DerivativeSettings())
+        # One that moves as it does in the others tells that the rest is in another unit.
+        small[0] = run(time, x=x, u=pairs[0][1] * 1e3, p=x * u)
+        with pytest.raises(DfsmError, match="as if in another unit"):
+            screened(small, ["x", "u", "p"], "refuse", (None, None), DerivativeSettings())
+
+
 def test_standard_errors_are_those_of_the_time_on_bunched_meshes():
     even = np.linspace(0, 100, 1001)
     bunched = np.unique(np.concatenate([even, np.linspace(50, 50.05, 1000)]))

@@ -95,7 +95,9 @@ def test_the_unit_of_a_capital_t_counts(tmp_path, header, names):
     assert run.names == names
     np.testing.assert_allclose(run.time, TIME)
     assert "no time column" in sentence(put(tmp_path / "b.csv", ["T [degC],x", *rows]))
-    assert "its time 'T' is in 'min'" in sentence(put(tmp_path / "c.csv", ["T [min],x", *rows]))
+    minutes = read(put(tmp_path / "c.csv", ["T [min],x", *rows]))
+    np.testing.assert_allclose(minutes.time, 60 * WARM, rtol=1e-12)
+    assert "'T' is in min: times are converted to s" in minutes.notes
     assert read(put(tmp_path / "d.csv", ["T [s],x", *rows])).notes == ()
 
 
@@ -179,7 +181,11 @@ def test_seconds_of_that_size_stay_seconds(tmp_path, step):
 def test_stated_units_are_believed(tmp_path):
     rows = [f"{44927.5 + t / 86400!r},{i}" for i, t in enumerate(TIME.tolist())]
     assert read(put(tmp_path / "a.csv", ["Time [s],x", *rows])).time[0] == 44927.5
-    assert "is in 'days'" in sentence(put(tmp_path / "b.csv", ["Time [days],x", *rows]))
+    run = read(put(tmp_path / "b.csv", ["Time [days],x", *rows]))
+    np.testing.assert_array_equal(run.time, TIME)
+    rows = [f"{t / 86400!r},{i}" for i, t in enumerate((TIME + 50).tolist())]
+    run = read(put(tmp_path / "c.csv", ["Time [days],x", *rows]))
+    np.testing.assert_allclose(run.time, TIME + 50, rtol=1e-12)
 
 
 # -- dates, stamps, durations -------------------------------------------------------------------
@@ -297,13 +303,27 @@ def test_intervals_that_contradict_each_other_are_refused(tmp_path):
     assert read(put(tmp_path / "c.csv", same)).time[1] == pytest.approx(0.033)
 
 
-@pytest.mark.parametrize("unit", ["(min)", "(ms)", "[h]", "hr"])
-def test_openfast_s_text_with_a_time_in_another_unit_is_refused(tmp_path, unit):
+@pytest.mark.parametrize(
+    ("unit", "size"), [("(min)", 60.0), ("(ms)", 1e-3), ("[h]", 3600.0), ("hr", 3600.0)]
+)
+def test_openfast_s_text_with_a_time_in_another_unit_is_converted(tmp_path, unit, size):
     rows = [f"{t:9.3f}\t{x:9.4f}" for t, x in zip(TIME, WAVE, strict=True)]
     bare = unit.strip("()[]")
     for header in ([f"Time\tWave1Elev\n{unit}\t(m)"], [f"Time [{bare}]\tWave1Elev [m]"]):
-        path = put(tmp_path / "a.out", ["a title", *header, *rows])
-        assert f"its time 'Time' is in '{bare}', expected s: convert it" in sentence(path)
+        run = read(put(tmp_path / "a.out", ["a title", *header, *rows]))
+        np.testing.assert_allclose(run.time, size * TIME, rtol=1e-9)
+        assert any(f"'Time' is in {bare}: times are converted to s" in n for n in run.notes)
+    path = put(tmp_path / "b.out", ["a title", "Time\tWave1Elev\n(m)\t(m)", *rows])
+    assert "its time 'Time' is in 'm', expected s: convert it" in sentence(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_time_in_another_unit_is_converted_in_every_format(tmp_path, kind):
+    run = read(
+        saved(tmp_path, kind, {"Time (ms)" if kind != "mat" else "time": 1e3 * TIME, "x": WAVE})
+    )
+    size = 1.0 if kind != "mat" else 1e3  # its names hold no units
+    np.testing.assert_allclose(run.time, size * TIME, rtol=1e-12)
 
 
 def test_openfast_s_text_without_units_may_count_days_as_well(tmp_path):

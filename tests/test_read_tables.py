@@ -84,10 +84,19 @@ def test_csv_time_column_anywhere(tmp_path, time):
 
 
 @pytest.mark.parametrize(
+    ("time", "scale"), [("Time (ms)", 1e-3), ("t (min)", 60.0), ("time [h]", 3600.0)]
+)
+def test_csv_times_in_other_units_are_converted(tmp_path, time, scale):
+    run = read(text(tmp_path / "a.csv", f"{time},x\n1,2\n3,4\n"))
+    np.testing.assert_allclose(run.time, [scale, 3 * scale], rtol=1e-12)
+    assert any("times are converted to s" in note for note in run.notes)
+
+
+@pytest.mark.parametrize(
     ("content", "match"),
     [
         ("x,y\n1,2\n3,4\n", "no time column, expected .* found: x, y"),
-        ("Time (ms),y\n1,2\n3,4\n", "time 'Time' is in 'ms', expected s"),
+        ("Time (mm),y\n1,2\n3,4\n", "time 'Time' is in 'mm', expected s"),
         ("t,y\n1,2\n3\n", "line 3: 1 values, but the header names 2"),
         ("t,y\n1,2\n\n3,4,5\n", "line 4: 3 values"),
         ("t,y\n1,2\n2,*x*\n", r"line 3: '\*x\*' in column 2 is no number"),

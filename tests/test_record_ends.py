@@ -180,6 +180,10 @@ def test_held_values_and_bad_starts():
     first[0] = 0
     assert jumps_at_first(first)
     assert transient_end(T, np.sin(T)) is None
+    decay = np.exp(-0.15 * T) * np.cos(2 * T)
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(T))
+    for free in (decay, decay + noise, np.exp(-T), np.exp(-3 * T) + noise, np.round(decay**3, 4)):
+        assert transient_end(T, free) is None
     assert transient_end(T, np.sin(T) + 50 * np.exp(-T)) == pytest.approx(2.2, abs=0.5)
 
 

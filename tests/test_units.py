@@ -49,7 +49,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*outside the training range")
         ["deg/s", "deg/sec", "°/s", "degrees/s", "deg s^{-1}", "dps"],
         ["m/s^2", "m/s2", "m/s²", "m/s**2", "m/s/s", "m s-2", "m/(s*s)", "m/s-s"],
         ["-", "(-)", "[-]", "1", "unitless"],
-        ["degC", "°C", "deg C", "℃", "celsius", "C"],
+        ["degC", "°C", "deg C", "℃", "celsius", "C", "Deg C", "ºC", "º C", "Degrees Celsius"],
+        ["V", "Volts", "volt"],
+        ["L/min", "liters/min", "litre per minute"],
         ["rpm", "RPM", "rev/min", "r/min"],
         ["J/kg-K", "J/(kg K)", "J/kg/K"],
         ["Foo/s", "Foo/sec"],
@@ -87,6 +89,9 @@ def test_spellings_of_one_unit(spellings):
         ("mA", "A", 20, 0.02),
         ("N-m/deg", "N-m/rad", np.pi / 180, 1),
         ("lbf ft", "N-m", 1, 1.3558179483),
+        ("hp", "W", 1, 745.69987158),
+        ("mmHg", "kPa", 760, 101.32501444),
+        ("gpm", "L/min", 1, 3.785411784),
     ],
 )
 def test_values_are_converted(source, target, value, expected):

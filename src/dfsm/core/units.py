@@ -89,6 +89,17 @@ _NAMED: dict[str, tuple[float, _Powers]] = {
     **dict.fromkeys(("lb", "lbs", "lbm"), (0.45359237, _MASS)),
     "kgf": (9.80665, _FORCE),
     "lbf": (0.45359237 * 9.80665, _FORCE),
+    **dict.fromkeys(("volt", "volts"), (1.0, _VOLTAGE)),
+    **dict.fromkeys(("amp", "amps", "ampere", "amperes"), (1.0, {"A": 1.0})),
+    **dict.fromkeys(("watt", "watts"), (1.0, _POWER)),
+    **dict.fromkeys(("newton", "newtons"), (1.0, _FORCE)),
+    **dict.fromkeys(("pascal", "pascals"), (1.0, _PRESSURE)),
+    **dict.fromkeys(("liter", "liters", "litre", "litres"), (1e-3, {"m": 3.0})),
+    # Mechanical horsepower, and gallons of the United States.
+    "hp": (550 * 0.3048 * 0.45359237 * 9.80665, _POWER),
+    **dict.fromkeys(("gal", "gallon", "gallons"), (3.785411784e-3, {"m": 3.0})),
+    "gpm": (3.785411784e-3 / 60, {"m": 3.0, "s": -1.0}),
+    **dict.fromkeys(("mmHg", "torr"), (133.322387415, _PRESSURE)),
     "psi": (0.45359237 * 9.80665 / 0.0254**2, _PRESSURE),
     "atm": (101325.0, _PRESSURE),
     "Ncm": (1e-2, _ENERGY),
@@ -106,8 +117,10 @@ _ZERO = {"degC": 273.15, "degF": 273.15 - 32 * 5 / 9}
 _WORDS = {n.lower(): n for n in (*_PREFIXABLE, *_NAMED) if len(n) > 2 and n not in ("Ohm", "Nms")}
 
 _REWRITTEN = (
-    (re.compile(r"(°|degrees?|deg\.?)\s*(C|Celsius)\b|℃|\b[Cc]elsius\b|^\s*C\s*$"), "degC"),
-    (re.compile(r"(°|degrees?|deg\.?)\s*(F|Fahrenheit)\b|℉|\b[Ff]ahrenheit\b"), "degF"),
+    # º, the ordinal, stands on keyboards where ° does not.
+    (re.compile("º"), "°"),
+    (re.compile(r"(°|[Dd]egrees?|[Dd]eg\.?)\s*(C|Celsius)\b|℃|\b[Cc]elsius\b|^\s*C\s*$"), "degC"),
+    (re.compile(r"(°|[Dd]egrees?|[Dd]eg\.?)\s*(F|Fahrenheit)\b|℉|\b[Ff]ahrenheit\b"), "degF"),
     (re.compile("°"), " deg "),
     (re.compile("[µμ]"), "u"),
     (re.compile("[ΩΩ]"), "Ohm"),

@@ -163,6 +163,41 @@ def unknown_ends(features: Iterable[Feature]) -> tuple[float, float]:
     return max(late.values(), default=0.0), max(early.values(), default=0.0)
 
 
+def known_window(
+    run: Trajectory, features: Iterable[Feature], start: float | None, stop: float | None
+) -> tuple[float | None, float | None]:
+    """Start and stop in s of a fit or a comparison: where features ask for what is in the record.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    features
+        Of the model.
+    start, stop
+        Times in s that are asked for; None for the ends of the run.
+
+    Raises
+    ------
+    DfsmError
+        The run is no longer than what is unknown.
+    """
+    first, last = unknown_ends(features)
+    if not (first or last):
+        return start, stop
+    begin, end = float(run.time[0]) + first, float(run.time[-1]) - last
+    if begin >= end:
+        raise DfsmError(
+            f"{run.where} lasts {run.duration:g} s, and delayed or leading inputs are not known in "
+            f"its first {first:g} s and its last {last:g} s: leave it out, or shorten these times"
+        )
+    if first:
+        start = begin if start is None else max(start, begin)
+    if last:
+        stop = end if stop is None else min(stop, end)
+    return start, stop
+
+
 def acting_late(features: Iterable[Feature], controls: Iterable[str]) -> dict[str, str]:
     """Features that hold what a control did before, each with that control.
 

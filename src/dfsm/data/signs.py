@@ -23,6 +23,9 @@ _CHANGES, _REGULAR = 5, 0.9
 _JUMP = 10.0
 # Standard deviations of the second half within which all of it stays, but not the first tenth.
 _FAR = 6.0
+# A motion dies away whose third quarter is so much wider than its last, that rests within such a
+# share of its range, or whose neighbouring samples at last have no more in common than this.
+_WIDER, _RESTS, _ALIKE = 1.5, 0.005, 0.3
 
 
 @dataclass(frozen=True)
@@ -140,8 +143,21 @@ def jumps_at_first(values: Array) -> bool:
     return bool(usual > 0 and steps[0] > _JUMP * max(near, 0.1 * usual) and steps[0] > 2 * usual)
 
 
+def _dies_away(values: Array, half: int) -> bool:
+    """Whether the second half of a channel is the end of what its start began."""
+    later = values[half:]
+    third, last = np.array_split(later, 2)
+    if third.std() > _WIDER * last.std() or later.std() < _RESTS * np.ptp(values):
+        return True
+    moves = later - later.mean()
+    return bool(moves[1:] @ moves[:-1] < _ALIKE * (moves @ moves))
+
+
 def transient_end(time: Array, values: Array) -> float | None:
-    """Time in s until which a channel is far from all that it does later; None for none."""
+    """Time in s until which a channel is far from all that it does later; None for none.
+
+    Something must go on later: a free decay, to rest or to the noise of a sensor, is an experiment.
+    """
     half, tenth = len(values) // 2, len(values) // 10
     if tenth < _FEWEST or not np.isfinite(values).all():
         return None
@@ -150,7 +166,7 @@ def transient_end(time: Array, values: Array) -> float | None:
     if not spread > 0 or not (np.abs(values[:tenth] - middle) > _FAR * spread).any():
         return None
     far = np.abs(values - middle) > _FAR * spread
-    if far[half:].any():
+    if far[half:].any() or _dies_away(values, half):
         return None
     # What is far later on is no part of the start.
     return float(time[np.flatnonzero(far[: 2 * tenth])[-1]])

@@ -89,6 +89,8 @@ def screened(
         if odd is None:
             continue
         place, factor, word = odd
+        if _excited_less(kept, names, window, place, factor):
+            continue
         if what == "refuse" or len(kept) == 2:  # which of two is wrong, nobody knows
             run = kept[place]
             unit = run.channel(name).unit or "no unit"
@@ -98,6 +100,28 @@ def screened(
             )
         del kept[place]
     return kept
+
+
+def _excited_less(
+    runs: Sequence[Trajectory],
+    names: Sequence[str],
+    window: tuple[float | None, float | None],
+    place: int,
+    factor: float,
+) -> bool:
+    """Whether all that moves shrinks or grows with a channel: a small or a large run, no unit.
+
+    One channel alone says nothing. Where a square does it, as a power of a force and a speed, the
+    rest shrinks by the root.
+    """
+    parts = [run.window(*window) for run in runs]
+    spreads = np.array([[p[n].std() if n in p else 0.0 for n in names] for p in parts])
+    usual = np.median(np.delete(spreads, place, axis=0), axis=0)
+    moving = usual > 0
+    if moving.sum() < 2 or not (spreads[place, moving] > 0).all():
+        return False
+    ratio = np.log(spreads[place, moving] / usual[moving]) * np.sign(np.log(factor))
+    return bool((ratio >= abs(np.log(factor)) / 2 - _NEAR).all())
 
 
 def _without_strays(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -13,12 +13,12 @@ from dfsm.data.dataset import Dataset
 from dfsm.errors import DfsmError, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.doubts import Doubts
-from dfsm.fitting.records import data_warnings, held_records
+from dfsm.fitting.records import data_warnings
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.verdicts import Evidence, verdicts
 from dfsm.models.dfsm import DFSM
-from dfsm.models.stability import growths, places
+from dfsm.models.stability import Growth, growths, places
 from dfsm.simulation.simulate import Status, simulate
 
 # Training runs that are simulated to check a new model, and those of them along which pairs of
@@ -26,6 +26,9 @@ from dfsm.simulation.simulate import Status, simulate
 _CHECK_RUNS, _PAIRED_RUNS = 8, 3
 # Samples at which a model is evaluated together.
 _TOGETHER = 2**16
+# A growth is the plant's own where so little of all rows is left over, and where it is so many
+# times what that may have made of it.
+_NEXT_TO_NOTHING, _OF_ITSELF = 0.05, 5.0
 
 
 def check(
@@ -36,7 +39,7 @@ def check(
     Eigenvalues tell stability with the schedule frozen, pairs of rollouts along recorded paths.
     The last of what is returned are growths and verdicts, for the record.
     """
-    held = held_records(data, settings, samples)
+    held = doubt.held
     notes = data_warnings(data, settings, samples) + list(held.values())
     if not all(map(np.all, _finite(model, samples))):
         raise DfsmError(
@@ -48,6 +51,7 @@ def check(
     errors = None if doubt.outdated else np.pad(known, (0, len(samples.signals.latents)))
     longest = max(run.window(settings.start, settings.stop).duration for run in data)
     growing = growths(model, longest, errors)
+    grows = None if held else _grows_itself(model, growing, doubt)
     if unstable := [g for g in growing if g.unstable]:
         what = "linear fit" if model.e is None else "model"
         cure = (
@@ -56,6 +60,11 @@ def check(
         )
         if not doubt.cured_by_margin:
             cure = "what is told of its inputs may be why, and is to be mended first"
+        if grows is not None:
+            cure = (
+                f"next to nothing of its rows is left over ({doubt.unexplained:.1%}), so this is "
+                "what the plant does without its controller; linear.margin would spoil it"
+            )
         notes.append(
             f"the {what} is unstable at {places(unstable, model.schedule)} (fastest growth "
             f"{max(g.rate for g in unstable):.3g} 1/s): {cure}"
@@ -83,12 +92,29 @@ def check(
         growths=growing,
         refined=doubt.outdated,
         records={name: f"'{name}' is held between its samples" for name in held},
+        grows=grows,
     )
     judged = {
         "growth": [asdict(g) for g in growing],
         "verdicts": verdicts(samples, settings, evidence),
     }
     return notes, checks, judged
+
+
+def _grows_itself(model: DFSM, growing: Sequence[Growth], doubt: Doubts) -> float | None:
+    """Growth in 1/s that is the plant's own: told by a fit that leaves next to nothing.
+
+    What a fit leaves of a row may be an error of its eigenvalues of about that share.
+    """
+    if model.e is not None or doubt.outdated or doubt.reasons:
+        return None
+    if doubt.unexplained > _NEXT_TO_NOTHING:
+        return None
+    unstable = [g.rate for g in growing if g.unstable]
+    fastest = max(float(np.abs(np.linalg.eigvals(A)).max()) for A in model.linear_state_matrices())
+    if not unstable or max(unstable) < _OF_ITSELF * doubt.unexplained * fastest:
+        return None
+    return max(unstable)
 
 
 def _finite(model: DFSM, samples: Samples) -> Iterator[NDArray[np.bool_]]:

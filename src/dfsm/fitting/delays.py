@@ -1,15 +1,22 @@
-"""Inputs that act late: dead time, which least squares takes for slow dynamics.
+"""Inputs that act late, by dead time or a lag, which least squares takes for slow dynamics.
 
-Where what an input did some time ago explains a derivative much better than what it does now, the
-fit has no way to say so but a slower eigenvalue and a larger gain. The same row is fitted with the
-input delayed by a grid of times; the time that leaves least says by how much it is late.
+Where what inputs did some time ago explains a derivative much better than what they do now, the
+fit has no way to say so but a slower eigenvalue and a larger gain. The same row is fitted with
+inputs delayed by a grid of times, several of them together; the times that leave least say by how
+much they are late.
+
+A row of an order more is no dead time, though it looks like one: with d = dx/dt, the equation
+d' = -d / τ + β x + γ u says that d is β x + γ u behind a lag of τ. The row is therefore fitted
+with all of its inputs behind one lag, too, and what leaves least has the word.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from dfsm.core.types import Array
 from dfsm.fitting.residuals import Residuals, stacked
@@ -23,32 +30,56 @@ _SMALL, _LEAVES_OF_SMALL = 0.1, 0.1
 _LATE = 0.75
 # Intervals below which chance explains as much, delays tried, and the longest relative to a run.
 _FEWEST, _TRIED, _LONGEST = 150, 40, 0.2
+# Of several delays, one that the others do without costs less than so many times what they leave,
+# or than such a share of the residual's variance; and how often all are sought in turn.
+_DOES_WITHOUT, _COSTS, _ROUNDS = 2.0, 0.02, 6
+# A lag has the word before delays that leave so many times as much, and is the whole story only
+# where no more than this is unexplained with it: beyond, several things are missing.
+_CLEARER, _WHOLE = 2.0, 0.25
 
 
 @dataclass(frozen=True)
-class LateInput:
-    """How late an input acts on a row.
+class LateInputs:
+    """How late inputs act on a row.
 
     Attributes
     ----------
-    column
-        Of the inputs.
     seconds
-        The delay that explains most.
+        The delays that explain most, by column of the inputs.
+    left
+        Variance that is left with them.
     unexplained
-        What is left with it, relative to the derivative's standard deviation.
+        The same as a root relative to the derivative's standard deviation.
     small
-        Whether little is unexplained without it, too.
+        Whether little is unexplained without them, too.
     """
 
-    column: int
-    seconds: float
+    seconds: Mapping[int, float]
+    left: float
     unexplained: float
     small: bool
 
 
-def late_input(residuals: Residuals, columns: range) -> LateInput | None:
-    """The input whose delay explains most of what a row leaves over, if one explains much.
+@dataclass(frozen=True)
+class Lag:
+    """A lag between a row and all that it takes.
+
+    Attributes
+    ----------
+    seconds
+        Its time constant.
+    left, unexplained, small
+        As of `LateInputs`.
+    """
+
+    seconds: float
+    left: float
+    unexplained: float
+    small: bool
+
+
+def late_inputs(residuals: Residuals, columns: Sequence[int]) -> LateInputs | None:
+    """The inputs whose delays explain most of what a row leaves over, if they explain much.
 
     Parameters
     ----------
@@ -57,6 +88,55 @@ def late_input(residuals: Residuals, columns: range) -> LateInput | None:
     columns
         Inputs that may act late.
     """
+    search = _search(residuals)
+    moving = [c for c in columns if np.ptp(stacked(residuals.inputs)[:, c]) > 0]
+    if search is None or not moving:
+        return None
+    grid, shortest, share, rows = search
+    alike = min(grid.tolist(), key=lambda lag: rows.left(dict.fromkeys(moving, float(lag))))
+    # From none late, and from all late alike: of two that are, none alone explains much.
+    starts = [{}] if len(moving) == 1 else [{}, dict.fromkeys(moving, alike)]
+    found = [_in_turn(rows, grid, moving, start) for start in starts]
+    lags = _needed(rows, min(found, key=rows.left), (shortest, float(grid[-1])))
+    left = rows.left(lags)
+    if not lags or left >= share * rows.left({}):
+        return None
+    seconds = {c: lag * residuals.step for c, lag in sorted(lags.items())}
+    return LateInputs(seconds, left, *_relative(residuals, left))
+
+
+def lag_before(residuals: Residuals, columns: Sequence[int]) -> Lag | None:
+    """The lag between a row and what it takes that explains most, if it explains much.
+
+    Parameters
+    ----------
+    residuals
+        One row.
+    columns
+        What is behind the lag: the states and inputs, all of them.
+    """
+    search = _search(residuals)
+    if search is None:
+        return None
+    grid, shortest, share, rows = search
+    left = [rows.behind(columns, lag) for lag in grid]
+    k = int(np.argmin(left))
+    around = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 13)
+    finer = [rows.behind(columns, lag) for lag in around]
+    lag, least = float(around[int(np.argmin(finer))]), min(finer)
+    if k == len(grid) - 1 or lag < shortest or least >= share * rows.left({}):
+        return None
+    found = Lag(lag * residuals.step, least, *_relative(residuals, least))
+    return found if found.unexplained <= _WHOLE else None
+
+
+def is_lag(lag: Lag | None, late: LateInputs | None) -> bool:
+    """Whether a lag explains a row, and no delays do as well."""
+    return lag is not None and (late is None or late.left > _CLEARER * lag.left)
+
+
+def _search(residuals: Residuals) -> tuple[Array, float, float, _Rows] | None:
+    """Delays to try and the shortest to tell, in intervals, the share that they may leave; rows."""
     sizes = [len(run) for run in residuals.inputs]
     if residuals.unexplained <= _UNEXPLAINED or sum(sizes) < _FEWEST:
         return None
@@ -64,29 +144,59 @@ def late_input(residuals: Residuals, columns: range) -> LateInput | None:
     head = [0.0, 0.1, 0.25, 0.5, 0.75]
     grid = np.unique(np.concatenate([head, np.geomspace(1, max(longest, 1), _TRIED)]))
     shortest = _LATE * (residuals.sample or residuals.step) / residuals.step
-    small = residuals.unexplained <= _SMALL
-    share = _LEAVES_OF_SMALL if small else _LEAVES
-    delayed = _Delayed(residuals)
-    now, best = delayed.left(), None
-    for column in columns:
-        left = [delayed.left(column, lag) for lag in grid]
-        k = int(np.argmin(left))
-        around = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 13)
-        finer = [delayed.left(column, lag) for lag in around]
-        lag, least = float(around[int(np.argmin(finer))]), min(finer)
-        # At the end of the grid it is no delay that is sought, at its head no delay at all.
-        inside = k < len(grid) - 1 and lag >= shortest
-        if inside and least < share * now and (best is None or least < best[1]):
-            best = (column, least, lag)
-    if best is None:
-        return None
+    share = _LEAVES_OF_SMALL if residuals.unexplained <= _SMALL else _LEAVES
+    return grid, shortest, share, _Rows(residuals)
+
+
+def _relative(residuals: Residuals, left: float) -> tuple[float, bool]:
     spread = float(stacked(residuals.targets).std())
-    column, least, lag = best
-    return LateInput(column, lag * residuals.step, float(np.sqrt(least)) / spread, small)
+    return float(np.sqrt(left)) / spread, residuals.unexplained <= _SMALL
 
 
-class _Delayed:
-    """Variance that a linear fit leaves with one input delayed."""
+def _in_turn(
+    rows: _Rows, grid: Array, columns: Sequence[int], start: Mapping[int, float]
+) -> dict[int, float]:
+    """Delays of all columns, each sought with the others as they are, the best one first."""
+    lags = dict(start)
+
+    def best(column: int, tried: Array) -> tuple[float, float]:
+        return min((rows.left({**lags, column: float(lag)}), float(lag)) for lag in tried)
+
+    for _ in range(_ROUNDS):
+        before = dict(lags)
+        rest = list(columns)
+        while rest:
+            tried = {c: best(c, grid) for c in rest}
+            first = min(rest, key=lambda c: tried[c][0])
+            rest.remove(first)
+            lags[first] = tried[first][1]
+        if lags == before:
+            break
+    places = {c: int(np.searchsorted(grid, lags[c])) for c in columns}
+    for _ in range(2):
+        for column, k in places.items():
+            around = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 13)
+            lags[column] = best(column, around)[1]
+    return lags
+
+
+def _needed(rows: _Rows, lags: Mapping[int, float], ends: tuple[float, float]) -> dict[int, float]:
+    """The delays that the others cannot do without, the least needed going first."""
+    # At the end of the grid it is no delay that is sought, at its head no delay at all.
+    kept = {c: lag for c, lag in lags.items() if ends[0] <= lag < ends[1]}
+    costs = _COSTS * rows.left({})
+    while kept:
+        left = rows.left(kept)
+        without = {c: rows.left({k: v for k, v in kept.items() if k != c}) for c in kept}
+        least = min(kept, key=lambda c: without[c])
+        if without[least] > max(_DOES_WITHOUT * left, left + costs):
+            break
+        del kept[least]
+    return kept
+
+
+class _Rows:
+    """Variance that a linear fit leaves with some of its inputs late."""
 
     def __init__(self, residuals: Residuals) -> None:
         self.runs = residuals.inputs
@@ -94,22 +204,43 @@ class _Delayed:
         X, y = X - X.mean(axis=0), y - y.mean()
         self.table = np.column_stack([X, y])
         self.gram = self.table.T @ self.table
+        self.shifted: dict[tuple[int, float], tuple[Array, Array]] = {}
 
-    def left(self, column: int | None = None, lag: float = 0.0) -> float:
-        """Variance left, the input in one column being so many intervals late."""
-        gram, n = self.gram, len(self.table)
-        if column is not None:
+    def left(self, lags: Mapping[int, float]) -> float:
+        """Variance left, the inputs in some columns being so many intervals late."""
+        late = {c: self._late(c, lag) for c, lag in lags.items() if lag}
+        gram = self.gram.copy()
+        for column, (_, products) in late.items():
+            gram[column], gram[:, column] = products, products
+        for column, (values, _) in late.items():
+            for other, (others, _) in late.items():
+                gram[column, other] = values @ others
+        return self._rest(gram)
+
+    def behind(self, columns: Sequence[int], lag: float) -> float:
+        """Variance left, all of some columns being behind a first-order lag."""
+        table = self.table.copy()
+        some = list(columns)
+        lagged = stacked([_lagged(run[:, some], lag) for run in self.runs])
+        table[:, some] = lagged - lagged.mean(axis=0)
+        return self._rest(table.T @ table)
+
+    def _late(self, column: int, lag: float) -> tuple[Array, Array]:
+        """An input so late, and its products with the table."""
+        if (column, lag) not in self.shifted:
             late = stacked([_shifted(run[:, column], lag) for run in self.runs])
             late = late - late.mean()
-            products = self.table.T @ late
-            gram = gram.copy()
-            gram[column], gram[:, column] = products, products
-            gram[column, column] = late @ late
+            self.shifted[column, lag] = late, self.table.T @ late
+        return self.shifted[column, lag]
+
+    def _rest(self, gram: Array) -> float:
         scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         gram = gram / np.outer(scale, scale)
         inner, right = gram[:-1, :-1], gram[:-1, -1]
         share = 1 - right @ np.linalg.lstsq(inner, right, rcond=1e-12)[0]
-        return float(share * scale[-1] ** 2 / n)
+        # Rounding leaves something of everything.
+        share = max(float(share), 1e-12)
+        return share * float(scale[-1]) ** 2 / len(self.table)
 
 
 def _shifted(values: Array, lag: float) -> Array:
@@ -117,11 +248,44 @@ def _shifted(values: Array, lag: float) -> Array:
     return np.interp(at - lag, at, values)
 
 
-def late_note(row: str, name: str, late: LateInput, unexplained: float) -> str:
-    """Which input acts late, by how much, and what to set."""
+def _lagged(values: Array, lag: float) -> Array:
+    """Behind a lag of so many intervals that was at rest, lines in between."""
+    if not lag:
+        return values
+    decay = float(np.exp(-1 / lag))
+    held = (1 - decay) * lag
+    driving = (held - decay) * values[:-1] + (1 - held) * values[1:]
+    bands = np.stack([np.ones(len(values)), np.full(len(values), -decay)])
+    return scipy.linalg.solve_banded((1, 0), bands, np.concatenate([values[:1], driving]))
+
+
+def late_note(row: str, names: Sequence[str], late: LateInputs, unexplained: float) -> str:
+    """Which inputs act late, by how much, and what to set."""
+    told = [(names[c], f"{s:.3g}") for c, s in late.seconds.items()]
+    one = len(told) == 1
+    acting = " and ".join(
+        f"'{name}' acts about {s} s late" if k == 0 else f"'{name}' about {s} s"
+        for k, (name, s) in enumerate(told)
+    )
+    features = ", ".join(f"{{source: {name}, kind: delay, seconds: {s}}}" for name, s in told)
     return (
-        f"{row}: '{name}' acts about {late.seconds:.3g} s late: so delayed it leaves "
+        f"{row}: {acting}: so delayed {'it leaves' if one else 'they leave'} "
         f"{late.unexplained:.1%} of the row unexplained instead of {unexplained:.1%}, and without "
-        "the delay the fit takes it for slower dynamics; add the feature "
-        f"{{source: {name}, kind: delay, seconds: {late.seconds:.3g}}}"
+        f"the delay{'s' * (not one)} the fit takes it for slower dynamics; add the "
+        f"feature{'s' * (not one)} {features}"
+    )
+
+
+def lag_note(row: str, state: str, order: int, lag: Lag, unexplained: float) -> str:
+    """That a row wants an order more, and what to set."""
+    cure = (
+        f"set {{name: {state}, order: 2}} among signals.states"
+        if order == 1
+        else "record what is in between (what an actuator does, not what it is told) and make it a "
+        "state; for a disturbance a feature of kind lag may do"
+    )
+    return (
+        f"{row}: all that acts on it acts through a lag of about {lag.seconds:.3g} s, which leaves "
+        f"{lag.unexplained:.1%} of the row unexplained instead of {unexplained:.1%}: something in "
+        f"between is missing, as an actuator or an inertia, and its coefficients are wrong; {cure}"
     )

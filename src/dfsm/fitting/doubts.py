@@ -7,17 +7,17 @@ Each question has a file of its own; here they are put to every row that was fit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from dfsm.core.types import Array
-from dfsm.data.derivatives import kinematic_rows
+from dfsm.data.derivatives import StateSpec, kinematic_rows
 from dfsm.fitting.coloured import pulled, pulled_note
-from dfsm.fitting.delays import late_input, late_note
+from dfsm.fitting.delays import LateInputs, is_lag, lag_before, lag_note, late_inputs, late_note
 from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
 from dfsm.fitting.noisy_inputs import noise_shares
@@ -71,12 +71,18 @@ class Doubts:
         The same for verdicts.
     outdated
         Whether rollouts have changed the coefficients since.
+    unexplained
+        RMS that the linear fit leaves of its worst row, relative to the row's standard deviation.
+    held
+        Channels whose samples stay where the fit takes them for motion, with a sentence each.
     """
 
     notes: tuple[str, ...]
     errors: Array
     reasons: tuple[Reason, ...] = ()
     outdated: bool = False
+    unexplained: float = 1.0
+    held: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def cured_by_margin(self) -> bool:
@@ -85,7 +91,12 @@ class Doubts:
 
 
 def doubts(
-    samples: Samples, fit: LinearFit, left: Array, settings: FitSettings, intervals: bool = False
+    samples: Samples,
+    fit: LinearFit,
+    left: Array,
+    settings: FitSettings,
+    held_channels: Mapping[str, str],
+    intervals: bool = False,
 ) -> Doubts:
     """Question the linear fit of the derivatives.
 
@@ -99,6 +110,8 @@ def doubts(
         What it leaves of those that are not kinematic, ``(sample, row)``.
     settings
         Settings.
+    held_channels
+        Those whose samples stay where the fit takes them for motion, with a sentence each.
     intervals
         Whether the samples are means over intervals.
     """
@@ -117,18 +130,35 @@ def doubts(
                 Reason(name, "coarse", "its samples are too far apart", "a finer record")
             )
     laws: dict[int, Law] = {}
+    worst = 0.0
     names, driving = samples.linear_names, len(samples.signals.driving)
     for place, row in enumerate(r for r in range(len(mean)) if r not in kinematic):
         name, target = samples.derivative_names[row][0], samples.derivatives[:, row]
         errors[row] = standard_errors(even, even_left[:, place], parts)
+        spread = max(float(std_over(target, samples.weights)), np.finfo(float).tiny)
+        worst = max(worst, float(std_over(left[:, place], samples.weights)) / spread)
         held = {column for r, column in fit.model.known if r == row}
         errors[row, list(held)] = 0.0
         for text in _noise(name, samples, inputs, target, mean[row]):
             notes.append(text)
             reasons.append(Reason(name, "noise", "an input is noisy", "a smoother record of it"))
         series = residuals_of(samples.times, inputs, target, left[:, place])
-        note = None
+        note = late = None
         if series is not None:
+            late = _late(series, names[:driving], settings)
+            states = samples.signals.state_columns
+            columns = [*range(driving), *range(states.start, states.stop)]
+            lag = None
+            # What is held is late by itself.
+            if fit.model.schedule is None and not held_channels:
+                lag = lag_before(series, columns)
+            if lag is not None and is_lag(lag, late):
+                about = _state_of(samples, row)
+                notes.append(lag_note(name, about.name, about.order, lag, series.unexplained))
+                if not lag.small:
+                    cure = "the order told" if about.order == 1 else "what is told of it"
+                    reasons.append(Reason(name, "late", "a lag is missing in it", cure))
+                continue
             note = _feedback(samples, series, mean, row, held, laws)
         if note:
             notes.append(note)
@@ -144,11 +174,18 @@ def doubts(
             reasons.append(
                 Reason(name, "rough", "an input is too rough for its mesh", "what is told of it")
             )
-        if series is not None and (found := late_input(series, range(driving))):
-            notes.append(late_note(name, names[found.column], found, series.unexplained))
+        if late is not None and series is not None:
+            # By a sample, which looks like holding for half of one on either side.
+            held_channels = {
+                n: text
+                for n, text in held_channels.items()
+                if n not in {names[c] for c in late.seconds}
+            }
+            notes.append(late_note(name, names, late, series.unexplained))
             # A delay that costs little is no reason against the model.
-            late = f"'{names[found.column]}' acts late on it"
-            reasons += [Reason(name, "late", late, "the delay told")] * (not found.small)
+            which = " and ".join(f"'{names[c]}'" for c in late.seconds)
+            what = f"{which} act{'s' * (len(late.seconds) == 1)} late on it"
+            reasons += [Reason(name, "late", what, "the delay told")] * (not late.small)
         elif series is not None and fit.model.schedule is None:
             free = [c for c in range(len(samples.signals.controls)) if c not in held]
             for twice in pulled(series, free):
@@ -161,7 +198,31 @@ def doubts(
                         _EXCITE,
                     )
                 )
-    return Doubts(tuple(notes), errors, tuple(reasons))
+    return Doubts(tuple(notes), errors, tuple(reasons), False, worst, held_channels)
+
+
+def _late(series: Residuals, names: Sequence[str], settings: FitSettings) -> LateInputs | None:
+    """Delays that are not there as features yet, to a sample: what these leave is no new delay."""
+    given = [(f.source, f.seconds) for f in settings.features if f.seconds is not None]
+
+    def there(column: int, seconds: float) -> bool:
+        near = max(series.sample, series.step)
+        return any(names[column] == n and abs(seconds - s) <= near for n, s in given)
+
+    columns = list(range(len(names)))
+    while (late := late_inputs(series, columns)) is not None:
+        again = [c for c, seconds in late.seconds.items() if there(c, seconds)]
+        if not again:
+            return late
+        columns = [c for c in columns if c not in again]
+    return None
+
+
+def _state_of(samples: Samples, row: int) -> StateSpec:
+    """Which state a row is the highest derivative of."""
+    specs = samples.signals.specs
+    second = [spec for spec in specs if spec.order == 2]
+    return specs[row] if row < len(specs) else second[row - len(specs)]
 
 
 def memory_doubt(model: DFSM) -> list[str]:

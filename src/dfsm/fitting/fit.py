@@ -40,6 +40,7 @@ from dfsm.fitting.known import fitted_rows, known_coefficients, wakes_of
 from dfsm.fitting.linear import LPV, LinearFit, fit_linear, schedule_windows
 from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
+from dfsm.fitting.records import held_records
 from dfsm.fitting.region import region_of
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
 from dfsm.fitting.rough_inputs import inputs_told
@@ -130,7 +131,8 @@ def fit(
     with _timed(seconds, "doubts"):
         fitted = fitted_rows(rows, settings)
         left = left_over(f.model, rows, rows.linear_inputs, rows.derivatives, fitted)
-        doubt = doubts(rows, f, left, settings, intervals=rows is not samples)
+        held = held_records(data, settings, samples)
+        doubt = doubts(rows, f, left, settings, held, intervals=rows is not samples)
         del left
     with _timed(seconds, "corrective functions"):
         later = hidden is not None or (refinement is not None and refinement.network > 0)

@@ -8,7 +8,7 @@ from dfsm.data.signs import held_interval, wrap_notes
 from dfsm.data.stuck import stuck_notes
 from dfsm.data.wind import wind_warning
 from dfsm.fitting.held_inputs import held_note, held_unseen
-from dfsm.fitting.samples import Samples, known_window
+from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 
 
@@ -64,11 +64,18 @@ def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict
     chosen = settings.inputs or {}
     if isinstance(chosen, str) or samples.weights is not None:
         return {}
-    names, states = samples.signals.driving, [s.name for s in settings.states]
-    runs = [run.window(*known_window(run, settings)) for run in data]
-    found = held_unseen(
-        lambda: ((run.select(states).values, run.select(names).values) for run in runs)
-    )
+    names = samples.signals.driving
+    states = [n for s in settings.states for n in (s.name, s.rate) if n is not None]
+    complete = all(s.order == 1 or s.rate is not None for s in settings.states)
+    runs = [run.window(*settings.window_of(run)) for run in data]
     kinds = samples.signals.between
-    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in chosen]
+    known = [k for k, kind in enumerate(kinds) if kind == "hold"]
+    found = held_unseen(
+        lambda: ((run.select(states).values, run.select(names).values) for run in runs),
+        complete,
+        known,
+    )
+    # A feature is not given out by anybody: it goes between samples as what it is made of lets it.
+    named = {*chosen, *(f.name for f in settings.features)}
+    lines = [names[k] for k in found if kinds[k] == "linear" and names[k] not in named]
     return {name: held_note(name) for name in lines}

@@ -13,7 +13,7 @@ import numpy as np
 
 from dfsm.data.dataset import Dataset
 from dfsm.errors import hushed
-from dfsm.fitting.samples import Samples, known_window
+from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.hidden import latents_along
@@ -29,7 +29,7 @@ def with_latents(model: DFSM, data: Dataset, samples: Samples, settings: FitSett
         return replace(samples, terms=model.terms)
     paths = []
     for run in data:
-        inside = np.isin(run.time, run.window(*known_window(run, settings)).time)
+        inside = np.isin(run.time, run.window(*settings.window_of(run)).time)
         paths.append(latents_along(model, run)[inside])
     s = model.signals
     if s.telling:
@@ -71,6 +71,6 @@ def along_rollouts(model: DFSM, data: Dataset, samples: Samples, settings: FitSe
             rollouts = simulate(model, data[some], start=settings.start, stop=settings.stop)
         for run, rollout, rows in zip(data[some], rollouts, parts[some], strict=True):
             if rollout.status is Status.COMPLETED:
-                inside = rollout.trajectory.window(*known_window(run, settings))
+                inside = rollout.trajectory.window(*settings.window_of(run))
                 inputs[rows, columns] = inside.select(names).values
     return replace(samples, inputs=inputs)

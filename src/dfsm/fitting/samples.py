@@ -27,7 +27,6 @@ from dfsm.data.derivatives import (
     state_names,
     state_units,
 )
-from dfsm.data.features import unknown_ends
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
 from dfsm.data.suspects import screened
@@ -251,12 +250,12 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         extracted = differentiate(run, settings.states, settings.derivatives, breaks)
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
-        inside = whole.window(*known_window(whole_run, settings))
+        inside = whole.window(*settings.window_of(whole_run))
         rows = np.isin(whole.time, inside.time)
         order = InputOrder(
             settings.controls, settings.driving, extracted.names, settings.parameters
         )
-        seen = run.window(*known_window(whole_run, settings))
+        seen = run.window(*settings.window_of(whole_run))
         times.append(seen.time)
         recorded.append(_columns(seen, settings.outputs))
         place = slice(begin, begin := begin + len(times[-1]))
@@ -302,7 +301,7 @@ def _places(data: Dataset, settings: FitSettings) -> dict[str, Array]:
     count, azimuth = 0, settings.azimuth
     for run in data:
         used = lead_in(run, settings.start, settings.derivatives)
-        count += len(used.window(*known_window(run, settings)))
+        count += len(used.window(*settings.window_of(run)))
     driving = len(settings.controls) + len(settings.driving) + len(settings.parameters)
     states = len(state_names(settings.states))
     blades = 0 if azimuth is None or azimuth.rings else 2
@@ -321,25 +320,8 @@ def _rough(data: Dataset, signals: SignalTable, settings: FitSettings) -> tuple[
     """Names of the inputs that are joined by lines and turn at nearly every sample."""
     driving = [run.select(signals.driving) for run in data]
     pairs = zip(data, driving, strict=True)
-    runs = [few.window(*known_window(run, settings)) for run, few in pairs]
+    runs = [few.window(*settings.window_of(run)) for run, few in pairs]
     return rough_ones(runs, signals.driving, signals.between)
-
-
-def known_window(run: Trajectory, settings: FitSettings) -> tuple[float | None, float | None]:
-    """Start and stop of a fit in s: where no delay or lead asks for what is not in the record."""
-    first, last = unknown_ends(settings.features)
-    if not (first or last):
-        return settings.start, settings.stop
-    start, stop = float(run.time[0]) + first, float(run.time[-1]) - last
-    if start >= stop:
-        raise DfsmError(
-            f"{run.where} lasts {run.duration:g} s, and delayed or leading inputs are not known in "
-            f"its first {first:g} s and its last {last:g} s: leave it out, or shorten these times"
-        )
-    return (
-        start if settings.start is None else max(start, settings.start),
-        stop if settings.stop is None else min(stop, settings.stop),
-    )
 
 
 def _signals(data: Dataset, settings: FitSettings) -> SignalTable:

@@ -8,10 +8,10 @@ from dataclasses import field
 from dfsm.core.settings import require, settings_class
 from dfsm.data.between import Chosen, resolved
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
-from dfsm.data.features import Feature
+from dfsm.data.features import Feature, known_window
 from dfsm.data.slower import Slower
 from dfsm.data.suspects import SUSPECTS, Suspects
-from dfsm.data.trajectory import Role
+from dfsm.data.trajectory import Role, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import CorrectiveSettings
 from dfsm.fitting.corrective.perceptron import MLP
@@ -109,6 +109,10 @@ class FitSettings:
     def driving(self) -> tuple[str, ...]:
         """Names of all disturbances, the computed ones last."""
         return (*self.disturbances, *(f.name for f in self.features))
+
+    def window_of(self, run: Trajectory) -> tuple[float | None, float | None]:
+        """Start and stop in s of what a whole record teaches, see `known_window`."""
+        return known_window(run, self.features, self.start, self.stop)
 
     @property
     def roles(self) -> dict[str, Role]:

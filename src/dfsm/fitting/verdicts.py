@@ -50,6 +50,9 @@ class Evidence:
         Whether rollouts taught the model.
     records
         What is wrong with records of states or inputs, by channel.
+    grows
+        At which rate the plant itself grows in open loop, in 1/s; None where it does not, or where
+        nobody can tell it from a fault of the fit.
     """
 
     rollouts: Mapping[int, Simulation]
@@ -57,6 +60,7 @@ class Evidence:
     growths: Sequence[Growth]
     refined: bool
     records: Mapping[str, str] = field(default_factory=dict)
+    grows: float | None = None
 
 
 def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> list[dict[str, Any]]:
@@ -102,7 +106,8 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
             reason, advice = ("", "") if doubt is None else (f", and {doubt[0]}", doubt[1])
             if doubt is None:
                 reason, advice = _advice(name, settings, evidence)
-            text = f"{verdict}, because {why}{reason}; try {advice}"
+            rollouts = " on its own" if doubt is None and evidence.grows is not None else ""
+            text = f"{verdict}{rollouts}, because {why}{reason}; try {advice}"
         elif doubt is not None:
             verdict = "for trends only"
             text = f"{verdict}, because {doubt[0]}, although {why}; try {doubt[1]}"
@@ -144,6 +149,13 @@ def _doubt(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, s
 
 def _advice(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, str]:
     """Why, as far as anything tells, and what to try first."""
+    if evidence.grows is not None:
+        return (
+            ", as they must of a plant that is unstable in open loop (it grows by "
+            f"{evidence.grows:.3g} 1/s), however well it is fitted, as this one is",
+            "it in closed loop with a controller, or over windows of about "
+            f"{2 / evidence.grows:.2g} s each; a margin would only spoil it",
+        )
     unstable = any(g.unstable for g in evidence.growths)
     if unstable and settings.linear.margin is None:
         return ", and the model is unstable", "linear.margin, or refine"

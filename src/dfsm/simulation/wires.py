@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import Controller
-from dfsm.core.units import agree, factor
+from dfsm.core.types import Array
+from dfsm.core.units import agree, conversion
 from dfsm.data.derivatives import per_second
 from dfsm.errors import DfsmError, near_matches
 from dfsm.models.dfsm import DFSM
@@ -27,20 +28,20 @@ class Wires:
     ----------
     sources
         Group and column of every measurement; group ``"rates"`` are derivatives of states.
-    factors
-        What one unit of the model is in the controller's unit, per measurement.
+    readings
+        Factor and summand from the model's unit to the controller's, per measurement.
     commanded
         Column of the control that each command sets.
-    command_factors
-        What one unit of the controller is in the model's unit, per command.
+    settings
+        The same per command.
     held
         Which exogenous inputs keep the value of a sample until the next.
     """
 
     sources: tuple[tuple[str, int], ...]
-    factors: tuple[float, ...]
+    readings: tuple[tuple[float, float], ...]
     commanded: tuple[int, ...]
-    command_factors: tuple[float, ...]
+    settings: tuple[tuple[float, float], ...]
     held: tuple[bool, ...]
 
     @property
@@ -73,12 +74,14 @@ class Wires:
         if self.reads_outputs:
             psi = None if model.signals.azimuth is None else blades[0]
             groups["outputs"] = model.output(states, u, w, p, psi, blades[1])
-        pairs = zip(self.sources, self.factors, strict=True)
-        return jnp.stack([groups[group][column] * factor for (group, column), factor in pairs])
+        seen = jnp.stack([groups[group][column] for group, column in self.sources])
+        scale, zero = _columns(self.readings)
+        return seen * scale + zero
 
     def commands_of(self, exogenous: jax.Array) -> jax.Array:
         """What the controller would have set, in its units, ``(command,)``."""
-        return exogenous[np.array(self.commanded, dtype=int)] / np.array(self.command_factors)
+        scale, zero = _columns(self.settings)
+        return exogenous[np.array(self.commanded, dtype=int)] * scale + zero
 
     def with_commands(self, exogenous: jax.Array, commands: jax.Array) -> jax.Array:
         """Exogenous inputs ``(..., exogenous)`` with the controls set, in the model's units.
@@ -100,7 +103,8 @@ class Wires:
 
     def in_model_units(self, commands: jax.Array) -> jax.Array:
         """Commands ``(..., command)`` of the controller in the model's units."""
-        return commands * np.array(self.command_factors)
+        scale, zero = _columns(self.settings)
+        return (commands - zero) / scale
 
 
 def connect(
@@ -131,16 +135,16 @@ def connect(
                 + near_matches(name, controller.measurements)
             )
     known = _signals(model)
-    sources, factors = [], []
+    sources, readings = [], []
     for name, unit in zip(controller.measurements, controller.measurement_units, strict=True):
         signal = measurements.get(name, name)
         if signal not in known:
             raise _not_measured(name, signal, model)
         source, its = known[signal]
         sources.append(source)
-        factors.append(_factor(signal, its, unit))
+        readings.append(_conversion(signal, its, unit))
     controls = model.signals.controls
-    names, commanded, command_factors = model.signals.names("controls"), [], []
+    names, commanded, settings = model.signals.names("controls"), [], []
     for name, unit in zip(controller.commands, controller.command_units, strict=True):
         if name not in names:
             raise DfsmError(
@@ -148,9 +152,9 @@ def connect(
                 + near_matches(name, names)
             )
         commanded.append(names.index(name))
-        command_factors.append(1 / _factor(name, controls[commanded[-1]].unit, unit))
+        settings.append(_conversion(name, controls[commanded[-1]].unit, unit))
     held = tuple(kind == "hold" for kind in model.signals.between_samples())
-    return Wires(tuple(sources), tuple(factors), tuple(commanded), tuple(command_factors), held)
+    return Wires(tuple(sources), tuple(readings), tuple(commanded), tuple(settings), held)
 
 
 def not_commanded(model: DFSM, controller: Controller) -> list[str]:
@@ -187,14 +191,20 @@ def _not_measured(name: str, signal: str, model: DFSM) -> DfsmError:
     )
 
 
-def _factor(name: str, source: str, target: str) -> float:
-    """What one unit `source` is in `target`."""
+def _conversion(name: str, source: str, target: str) -> tuple[float, float]:
+    """Factor and summand that take values in `source`, the model's unit, to `target`."""
     if agree(source, target):
-        return 1.0
-    found = factor(source, target)
+        return 1.0, 0.0
+    found = conversion(source, target)
     if found is None:
         raise DfsmError(
             f"'{name}' is in '{source}' in the model and in '{target}' in the controller, which do "
             "not convert into each other: change one of them"
         )
     return found
+
+
+def _columns(pairs: tuple[tuple[float, float], ...]) -> tuple[Array, Array]:
+    """Factors and summands of several conversions."""
+    scale, zero = np.array(pairs, dtype=float).reshape(-1, 2).T
+    return scale, zero

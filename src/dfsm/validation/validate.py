@@ -16,6 +16,7 @@ from dfsm.core.renamed import renamed
 from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.conversion import converted
+from dfsm.data.features import known_window
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.completion import all_completed
@@ -101,9 +102,15 @@ def validate(
     for run in runs:
         run.columns(first.signals.recorded)
     notes = [*converted(given, runs), *_leaks(first, runs, intervals)]
-    results = []
+    results, late = list[RunComparison](), list[str]()
     for run in track(runs, "test runs"):
-        results.append(_compare(models, run, (start, stop), settings, intervals))
+        known, until = known_window(run, first.signals.features, start, stop)
+        results.append(_compare(models, run, (known, until), settings, intervals))
+        if known != start:
+            late.append(
+                f"{run.where}: compared from {known:g} s on, for what acts there with a delay was "
+                "not recorded before"
+            )
     stepped = [
         f"{name} on {r.recorded.name}: {m.simulation.note}"
         for r in results
@@ -113,6 +120,8 @@ def validate(
     if stepped:
         more = f" (and {len(stepped) - 1} more rollouts alike)" if stepped[1:] else ""
         notes.append(stepped[0] + more)
+    if late:
+        notes.append(late[0] + (f" (and {len(late) - 1} more runs alike)" if late[1:] else ""))
     channels = (*first.signals.observed, *first.signals.outputs)
     validation = Validation(
         models=dict(models),

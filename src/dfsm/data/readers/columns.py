@@ -101,7 +101,7 @@ def named_time(
     Raises
     ------
     DfsmError
-        Its unit is not s.
+        Its unit is none of time.
     """
     ranks = {i: rank for i, c in enumerate(channels) if (rank := time_rank(c.name)) is not None}
     for at in sorted(ranks, key=lambda i: ranks[i]):
@@ -116,14 +116,14 @@ def named_time(
 
 
 def check_seconds(path: Path, name: str, unit: str) -> None:
-    """Refuse a time in another unit than s.
+    """Refuse a time whose unit is none of time; `seconds_of` converts what is.
 
     Raises
     ------
     DfsmError
-        It is.
+        It is in something else.
     """
-    if unit.lower() not in SECONDS:
+    if unit.lower() not in SECONDS and factor(unit, "s") is None:
         raise DfsmError(f"{path}: its time '{name}' is in '{unit}', expected s: convert it")
 
 
@@ -135,7 +135,7 @@ def time_column(
     Raises
     ------
     DfsmError
-        There is none, or its unit is not s.
+        There is none, or its unit is none of time.
     """
     at = named_time(path, channels, rising)
     if at is None:

@@ -28,6 +28,7 @@ from dfsm.core.types import Array
 from dfsm.data.readers.assemble import assemble
 from dfsm.data.readers.columns import time_column
 from dfsm.data.readers.text import Layout, Row, blank_cells, decode, number, read_rows
+from dfsm.data.readers.times import seconds_of
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 
@@ -89,6 +90,8 @@ def read_hawc2(path: str | Path) -> Trajectory:
     if scales is not None:
         time, told = _times(sel, time, abs(scales[at]), number(sizes[3]) or 0.0)
         notes += told
+    time, converted = seconds_of(channels[at].name, channels[at].unit, time)
+    notes += [converted] if converted else []
     return assemble(path, time, values[:, keep], kept, notes=notes)
 
 

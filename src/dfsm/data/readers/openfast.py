@@ -317,8 +317,8 @@ def _read_text(path: Path) -> Trajectory:
     rows, repeats = without_repeats(rows, heads[0], heads[1:])
     table = read_rows(rows, layout)
     # Some drivers leave the unit of the time open.
-    if units[0] != "-":
-        check_seconds(path, names[0], units[0])
+    unit = "" if units[0] == "-" else units[0]
+    check_seconds(path, names[0], unit)
     channels = [
         Channel(n, u, s) for n, u, s in zip(names[1:], units[1:], table.steps[1:], strict=True)
     ]
@@ -329,7 +329,7 @@ def _read_text(path: Path) -> Trajectory:
     if table.stamps is not None:
         notes.append(table.stamps.note(names[0]))
     else:
-        time, counted = seconds_of(names[0], units[0], time)
+        time, counted = seconds_of(names[0], unit, time)
         notes += [counted] if counted else []
     if path.suffix.lower().startswith(ROSCO_LOG) and len(time) > 1 and time[0] == time[1]:
         # ROSCO is called once before the simulation starts, and logs that call, too.

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dfsm.core.types import Array
+from dfsm.core.units import factor
 
 # How a time is called, first those that come first: a capital T is a temperature, a thrust, a
 # tension or a period as often, so that it is the last.
@@ -99,9 +100,17 @@ def seconds_of(name: str, unit: str, time: Array) -> tuple[Array, str]:
     Returns
     -------
     tuple
-        Seconds since the first where they count from 1970 or number days; else as they are.
+        Seconds since the first where they count from 1970 or number days, converted where they are
+        in another unit; else as they are.
     """
-    if unit or not len(time) or not np.isfinite(time).all():
+    finite = bool(len(time)) and bool(np.isfinite(time).all())
+    if unit.lower() not in SECONDS:
+        size = factor(unit, "s") or np.nan
+        for whose, (first, last) in _DAYS.items() if size == _DAY and finite else ():
+            if first <= time.min() and time.max() < last:
+                return _of_days(name, whose, time, dated=True)
+        return size * time, f"'{name}' is in {unit}: times are converted to s"
+    if unit or not finite:
         return time, ""
     dated = is_date_name(name)
     low, high = _SINCE_1970
