@@ -28,6 +28,7 @@ from dfsm.data.derivatives import (
     state_units,
 )
 from dfsm.data.features import unknown_until
+from dfsm.data.rates import with_rates_per_second
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
 from dfsm.data.suspects import screened
@@ -201,6 +202,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = in_one_unit([fill_slower(r, settings.slower) for r in runs], names)
+    runs = with_rates_per_second(runs, settings.states)
     window = settings.start, settings.stop
     for run in runs:
         run.window(*window)
