@@ -14,7 +14,7 @@ from dfsm.config.proposal import Proposal, propose
 from dfsm.config.template import fill
 from dfsm.data.derivatives import StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.demos.two_link_robot.study import draw
+from dfsm.demos.two_link_robot.multi_fidelity import draw
 from dfsm.errors import DfsmWarning
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
@@ -218,3 +218,13 @@ def test_the_arm_keeps_its_states() -> None:
     assert orders(found) == {"theta1": 2, "theta2": 1, "omega2": 1}
     assert [*found.controls, *found.disturbances] == ["tau1", "tau2"]
     assert not found.hidden
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 6, 9, 12, 40])
+def test_short_records_and_ramps_are_looked_at(count: int) -> None:
+    """A ramp has no second difference, and a few samples make no windows: both are proposed."""
+    time = 0.1 * np.arange(float(count))
+    columns: dict[str, Array] = {"x (m)": np.sin(time), "ramp (s)": time, "z (kg)": np.cos(time)}
+    found = proposed(recorded(columns, time))
+    roles = [*orders(found), *found.controls, *found.disturbances, *found.outputs]
+    assert sorted(roles) == ["ramp", "x", "z"]

@@ -113,7 +113,7 @@ class Windows:
             variance = np.var(rows.change[:, column])
             weight = 2.0 if order == 1 else 6.0
             own = weight * self.noise[column] ** 2 / (span * self.usual) ** (2 * order)
-            share = float(min(1.0, own / max(variance, np.finfo(float).tiny)))
+            share = float(own / max(variance, own, np.finfo(float).tiny))
             longer = self.rows(order, 2 * span).mean
             kept = np.var(longer[:, column]) if len(longer) >= 4 else 0.0
             motion = self.spread[column] ** 2 - self.noise[column] ** 2
