@@ -227,10 +227,11 @@ def test_init_tells_what_is_driven(recorded: Recorder, tmp_path: Path) -> None:
     assert [*proposal.controls, *proposal.disturbances] == ["u"]
     assert proposal.hidden
     # What the recorded channels leave of the derivative, and what to do, is said in the file.
-    rate = np.gradient(run["y"], run.time)
-    known = np.column_stack([run["u"], run["y"], np.ones(len(rate))])
+    rate = np.diff(run["y"]) / np.diff(run.time)
+    means = (run.values[1:] + run.values[:-1]) / 2
+    known = np.column_stack([means, np.ones(len(rate))])
     left = rate - known @ np.linalg.lstsq(known, rate, rcond=None)[0]
-    np.testing.assert_allclose(proposal.unexplained["y"], left.std() / rate.std(), rtol=1e-6)
+    np.testing.assert_allclose(proposal.unexplained["y"], left.std() / rate.std(), rtol=1e-3)
     write_table(run, tmp_path / "run.csv")
     told = write_config([str(tmp_path / "run.csv")], tmp_path / "config.yaml")
     assert told.startswith("Derivatives are not to be fitted here")

@@ -12,12 +12,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from dfsm.core.types import Array
+from dfsm.config.roles import Judge
 from dfsm.data.between import recognised
-from dfsm.data.derivatives import per_second
-from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.data.conversion import in_one_unit
+from dfsm.data.rates import matched_rates
+from dfsm.data.trajectory import Trajectory
+from dfsm.errors import hushed
 from dfsm.fitting.causes import driven_by_past, lost_its_sign
+from dfsm.numerics.time_mesh import uneven
 
 # What wind engineers usually choose; only names that exist are proposed. The rate of a rotor's
 # speed is none of its states: nothing that is recorded explains how it changes.
@@ -28,14 +32,10 @@ _OUTPUTS = ("TwrBsFxt", "TwrBsMyt", "GenPwr")
 WINDS = ("RotWind", "RtVAvgxh", "Wind1VelX")
 _WITH_WIND = ("RotShearV", "RotShearH", "Wave1Elev")
 _TURBINE = {*_SECOND_ORDER, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
-# Correlation with a channel's derivative from which another is its rate, and how far off one its
-# slope may be.
-_IS_RATE, _SLOPE = 0.9, 0.1
-# Share of a derivative's variance that others must explain in a state, and of its own in an output.
-_STATE, _OUTPUT = 0.6, 0.95
-# Explained by less, a state is not to be told by derivatives alone.
-_CLEAR = 0.95
-_MOST_SAMPLES, _MOST_CHANNELS = 4000, 60
+# RMS that is left of the rate of a state, and of a second derivative that nobody recorded, above
+# which a state is not to be told by derivatives alone: the latter are less sure on coarse samples.
+_CLEAR, _CLEAR_TWICE = 0.22, 0.1
+_MOST_CHANNELS = 60
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ class Proposal:
     unexplained: dict[str, float] = field(default_factory=dict)
 
 
+@threadpool_limits.wrap(limits=1)
 def propose(
     runs: Sequence[Trajectory], varying: Sequence[str], parameters: Sequence[str]
 ) -> Proposal:
@@ -91,8 +92,10 @@ def propose(
     varying, parameters
         Channels that all runs share and that vary, or are constant within but not over the runs.
     """
+    with hushed():  # told by what reads the configuration
+        runs = in_one_unit(runs, varying)
     reasons = dict.fromkeys(parameters, "constant within runs, not over them: parameter")
-    rates = _rates(runs[0], varying)
+    rates = matched_rates(runs, varying)
     for name, base in rates.items():
         reasons[name] = f"rate of {base}"
     kinds = recognised(runs, varying)
@@ -101,10 +104,7 @@ def propose(
         proposed = _of_turbine(varying, list(parameters), rates, reasons)
     else:
         reasons |= dict.fromkeys(held, "control: it stays and jumps, as what is held does")
-        proposed = _of_anything(runs[0], varying, list(parameters), rates, reasons)
-        states = {s["name"] for s in proposed.states} if proposed.hidden else set()
-        names = [n for n in varying if n in {*held, *proposed.controls} - states]
-        proposed = replace(proposed, controls=names)
+        proposed = _of_anything(runs, varying, list(parameters), rates, held, reasons)
     driving = {*proposed.controls, *proposed.disturbances}
     return replace(proposed, held=tuple(n for n in held if n in driving))
 
@@ -142,51 +142,47 @@ def _of_turbine(
 
 
 def _of_anything(
-    run: Trajectory,
+    runs: Sequence[Trajectory],
     varying: Sequence[str],
     parameters: list[str],
     rates: Mapping[str, str],
+    held: Sequence[str],
     reasons: dict[str, str],
 ) -> Proposal:
-    states, outputs, controls, disturbances = [], [], [], []
-    shares: list[float] = []
-    left: dict[str, float] = {}
-    names = [n for n in varying if n not in rates]
-    if len(names) > _MOST_CHANNELS:
+    # A rate of a rate tells nothing more, and would explain the rate by itself.
+    names = [n for n in varying if rates.get(n) not in rates]
+    if not names or len(names) > _MOST_CHANNELS:
         return Proposal([], [], [], parameters, [], [], reasons)
-    time, table = _thinned(run, names)
-    first = np.gradient(table, time, axis=0)
-    second = np.gradient(first, time, axis=0)
-    for i, name in enumerate(names):
-        if name in reasons:
-            continue
-        others = np.delete(table, i, axis=1)
-        known = next((r for r, base in rates.items() if base == name), None)
-        once = _explained(first[:, i], table)
-        left[name] = float(np.sqrt(max(0.0, 1 - once)))
-        twice = _explained(second[:, i], np.column_stack([table, first[:, i]]))
-        if known or (twice >= _STATE and twice > once):
-            states.append(_second_order(name, rates))
-            shares.append(twice)
-            reasons[name] = "state of order 2: its second derivative follows from it and the others"
-        elif once >= _STATE:
-            states.append({"name": name, "order": 1})
-            shares.append(once)
-            reasons[name] = "state: its rate follows from it and the others"
-        elif others.shape[1] and _explained(table[:, i], others) >= _OUTPUT:
-            outputs.append(name)
-            reasons[name] = "output: it follows from the others at once"
-        elif np.mean(np.diff(run[name]) == 0) > 1 / 2:
+    rates = {n: base for n, base in rates.items() if n in names}
+    found = Judge(runs, names, rates, held).roles()
+    clear = bool(found.orders) and all(found.left[n] <= _CLEAR for n in found.orders)
+    clear &= all(found.left[n] <= _CLEAR_TWICE for n, order in found.orders.items() if order == 2)
+    if not rates and not (clear and found.inputs):
+        run, measured = max(runs, key=len), [n for n in names if n not in found.outputs]
+        driven = driven_by_past(run, measured)
+        # Where both ways tell a state, they must tell the same one.
+        if driven and {*found.orders} <= {*driven}:
+            even = uneven([r.time for r in runs])[1] is None
+            hidden = _with_hidden(run, measured, driven, parameters, reasons, hidden=even)
+            reasons |= {n: found.reasons[n] for n in found.outputs}
+            left = {n: found.left[n] for n in driven if n in found.left} if even else {}
+            return replace(hidden, unexplained=left, outputs=found.outputs)
+    reasons |= {n: text for n, text in found.reasons.items() if n not in held or "set-p" in text}
+    states = [
+        _second_order(n, rates) | {"order": order} if order == 1 else _second_order(n, rates)
+        for n, order in found.orders.items()
+    ]
+    controls, disturbances = [], []
+    for name in found.inputs:
+        if name in held or name in found.set_points.values():
+            controls.append(name)
+        elif np.mean(np.diff(runs[0][name]) == 0) > 1 / 2:
             controls.append(name)
             reasons[name] = "control: it stays and jumps, and nothing recorded explains it"
         else:
             disturbances.append(name)
             reasons[name] = "disturbance (or control): nothing recorded explains it"
-    unclear = not shares or min(shares) < _CLEAR or not (controls or disturbances)
-    if not rates and unclear and (driven := driven_by_past(run, names)):
-        hidden = _with_hidden(run, names, driven, parameters, reasons)
-        return replace(hidden, unexplained={n: left[n] for n in driven if n in left})
-    return Proposal(states, controls, disturbances, parameters, outputs, [], reasons)
+    return Proposal(states, controls, disturbances, parameters, found.outputs, [], reasons)
 
 
 def _with_hidden(
@@ -195,12 +191,14 @@ def _with_hidden(
     driven: Sequence[str],
     parameters: list[str],
     reasons: dict[str, str],
+    hidden: bool,
 ) -> Proposal:
     """Roles where derivatives do not tell: what the past of others drives, and these others."""
     controls, disturbances = [], []
     for name in names:
         if name in driven:
-            reasons[name] = "state, with hidden ones beside it: the past of the others drives it"
+            beside = ", with hidden ones beside it" if hidden else ""
+            reasons[name] = f"state{beside}: the past of the others drives it"
             if lost_its_sign(run, name, names):
                 reasons[name] += "; it touches an end with kinks, as absolute values do"
         elif np.mean(np.diff(run[name]) == 0) > 1 / 2:
@@ -210,54 +208,9 @@ def _with_hidden(
             disturbances.append(name)
             reasons[name] = "disturbance (or control): no past of the others explains it"
     states = [{"name": name, "order": 1} for name in driven]
-    return Proposal(states, controls, disturbances, parameters, [], [], reasons, hidden=True)
+    return Proposal(states, controls, disturbances, parameters, [], [], reasons, hidden=hidden)
 
 
 def _second_order(name: str, rates: Mapping[str, str]) -> dict[str, Any]:
     rate = next((r for r, base in rates.items() if base == name), None)
     return {"name": name, "order": 2} | ({"rate": rate} if rate else {})
-
-
-def _rates(run: Trajectory, names: Sequence[str]) -> dict[str, str]:
-    """Channels that are the rate of another, each with that one; names may share no unit."""
-    if len(names) > 10 * _MOST_CHANNELS or len(run) < 10:
-        return {}
-    time, table = _thinned(run, names, every=False)
-    slopes = np.gradient(table, time, axis=0)
-    a, b = table - table.mean(axis=0), slopes - slopes.mean(axis=0)
-    covariance = b.T @ a / len(a)
-    size_a = np.maximum(a.std(axis=0), np.finfo(float).tiny)
-    size_b = np.maximum(b.std(axis=0), np.finfo(float).tiny)
-    likeness = covariance / np.outer(size_b, size_a)
-    slope = covariance / size_b[:, None] ** 2
-    found: dict[str, str] = {}
-    for i, base in enumerate(names):
-        for j, name in enumerate(names):
-            alike = likeness[i, j] > _IS_RATE and abs(slope[i, j] - 1) < _SLOPE
-            if i != j and alike and _fits(run.channel(base), run.channel(name)):
-                found[name] = base
-    return found
-
-
-def _fits(base: Channel, rate: Channel) -> bool:
-    return not base.unit or not rate.unit or per_second(base.unit) == rate.unit
-
-
-def _thinned(run: Trajectory, names: Sequence[str], every: bool = True) -> tuple[Array, Array]:
-    """Some thousand samples of the second half of a run; neighbours unless `every`."""
-    values, time = run.select(names).values, run.time
-    stride = max(1, len(time) // _MOST_SAMPLES) if every else 1
-    half = len(time) // 2 if len(time) > _MOST_SAMPLES else 0
-    keep = slice(half, None, stride) if every else slice(half, half + _MOST_SAMPLES)
-    return time[keep], np.nan_to_num(values[keep])
-
-
-def _explained(target: Array, inputs: Array) -> float:
-    """Share of a variance that a linear fit explains, less what chance does."""
-    X, y = inputs - inputs.mean(axis=0), target - target.mean()
-    X = X / np.maximum(X.std(axis=0), np.finfo(float).tiny)
-    total = float(y @ y)
-    if not total > 0:
-        return 0.0
-    left = y - X @ np.linalg.lstsq(X.T @ X, X.T @ y, rcond=1e-12)[0]
-    return 1 - float(left @ left) / total

@@ -178,10 +178,8 @@ def _hidden_told(proposed: Proposal) -> str:
     if not proposed.hidden:
         return ""
     left = ", ".join(f"{share:.0%} of that of {n}" for n, share in proposed.unexplained.items())
-    return (
-        f"Derivatives are not to be fitted here (what is recorded leaves {left}): hidden fits "
-        "rollouts instead"
-    )
+    why = f" (what is recorded leaves {left})" if left else ""
+    return f"Derivatives are not to be fitted here{why}: hidden fits rollouts instead"
 
 
 def _varies(values: Array) -> bool:

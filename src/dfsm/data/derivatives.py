@@ -64,7 +64,7 @@ class StateSpec:
     rate, acceleration
         Channels that hold q̇ and q̈ as the simulator computed them; where named they are used
         instead of differentiating (`acceleration` only with ``order=2``). The units must be the
-        state's unit per s and per s².
+        state's unit per s and per s²; `fit` converts others of that dimension.
 
     Raises
     ------

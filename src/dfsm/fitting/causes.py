@@ -17,6 +17,8 @@ from dfsm.numerics.folds import unfolded
 
 # Samples of the past, samples looked at, and channels beyond which it is not tried.
 _PAST, _MOST_SAMPLES, _MOST_CHANNELS = 10, 20_000, 12
+# Samples looked at where only the size of a gain counts.
+_GAINED = 4000
 # Samples looked at where signs are to be found first.
 _SIGNED = 2000
 # F statistic from which the past of others counts, and the share of what it tells of the channel
@@ -40,6 +42,19 @@ def driven_by_past(run: Trajectory, names: Sequence[str]) -> list[str]:
     return _driven(table, names) or _driven(_with_signs(table[:_SIGNED]), names)
 
 
+def gains_from_past(run: Trajectory, names: Sequence[str]) -> dict[str, float]:
+    """By how much its own past alone leaves more of each channel than with that of the others.
+
+    Empty where there are too few channels to ask, too many or too few samples.
+    """
+    table = np.nan_to_num(run.select(names).values[:_GAINED])
+    past = _lags(table)
+    if not 2 <= len(names) <= _MOST_CHANNELS or past < 2:
+        return {}
+    gains, _ = _gains(table, past)
+    return dict(zip(names, gains.tolist(), strict=True))
+
+
 def _with_signs(table: Array) -> Array:
     """The same where channels that an instrument folded have their signs again.
 
@@ -61,17 +76,27 @@ def lost_its_sign(run: Trajectory, name: str, names: Sequence[str]) -> bool:
 
 
 def _driven(table: Array, names: Sequence[str]) -> list[str]:
-    past = min(_PAST, len(table) // (10 * max(1, len(names))))
+    past = _lags(table)
     if past < 2:
         return []
-    table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), np.finfo(float).tiny)
-    lags = np.stack([table[past - k - 1 : len(table) - k - 1] for k in range(past)], axis=1)
-    gains = np.array([_gain(lags, table[past:], i) for i in range(len(names))])
-    counted = gains * (len(lags) - past * len(names)) / (past * (len(names) - 1)) > _COUNTS
+    gains, rows = _gains(table, past)
+    counted = gains * (rows - past * len(names)) / (past * (len(names) - 1)) > _COUNTS
     driven = counted & (gains >= _SHARE * gains.max())
     if not driven.any() or driven.all():
         return []
     return [name for name, is_driven in zip(names, driven, strict=True) if is_driven]
+
+
+def _lags(table: Array) -> int:
+    """Samples of the past that a table can tell of."""
+    return min(_PAST, len(table) // (10 * max(1, table.shape[1])))
+
+
+def _gains(table: Array, past: int) -> tuple[Array, int]:
+    """Gains of all channels, and the samples that they are judged on."""
+    table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), np.finfo(float).tiny)
+    lags = np.stack([table[past - k - 1 : len(table) - k - 1] for k in range(past)], axis=1)
+    return np.array([_gain(lags, table[past:], i) for i in range(table.shape[1])]), len(lags)
 
 
 def _gain(lags: Array, now: Array, column: int) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.data.dataset import Dataset
+from dfsm.data.rates import wrong_rates
 from dfsm.errors import DfsmError, hushed
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.doubts import Doubts
@@ -40,7 +41,9 @@ def check(
     The last of what is returned are growths and verdicts, for the record.
     """
     held = doubt.held
-    notes = data_warnings(data, settings, samples) + list(held.values())
+    windows = [run.window(settings.start, settings.stop) for run in data]
+    wrong = wrong_rates(windows, settings.states)
+    notes = data_warnings(data, settings, samples) + list(held.values()) + list(wrong.values())
     if not all(map(np.all, _finite(model, samples))):
         raise DfsmError(
             "the fitted model is not finite on its own training samples: fewer "
@@ -91,7 +94,8 @@ def check(
         doubts=None if doubt.outdated else doubt,
         growths=growing,
         refined=doubt.outdated,
-        records={name: f"'{name}' is held between its samples" for name in held},
+        records={name: f"'{name}' is held between its samples" for name in held}
+        | {name: f"the rate that is named with '{name}' is not its own" for name in wrong},
         grows=grows,
     )
     judged = {

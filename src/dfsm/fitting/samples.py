@@ -27,6 +27,7 @@ from dfsm.data.derivatives import (
     state_names,
     state_units,
 )
+from dfsm.data.rates import with_rates_per_second
 from dfsm.data.slower import fill_slower
 from dfsm.data.steps import Steps
 from dfsm.data.suspects import screened
@@ -200,6 +201,7 @@ def select(runs: Iterable[Trajectory], settings: FitSettings) -> Dataset:
         runs = [in_units_of(run, angle, "azimuth.angle") for run in runs]
     names.update(dict.fromkeys(n for f in settings.features for n in f.sources))
     runs = in_one_unit([fill_slower(r, settings.slower) for r in runs], names)
+    runs = with_rates_per_second(runs, settings.states)
     window = settings.start, settings.stop
     for run in runs:
         run.window(*window)

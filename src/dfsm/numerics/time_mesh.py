@@ -19,6 +19,8 @@ _MOST_DECIMALS = 8
 _FEWEST = 4
 # Share of the usual step below which two samples are one instant.
 _INSTANT = 1e-6
+# Share of the usual interval by which another may differ where samples are even.
+_UNEVEN = 0.05
 # Samples of a mesh that are looked at together, and those of many channels.
 _BLOCK, _ROWS = 1_000_000, 2**16
 
@@ -270,3 +272,16 @@ def instants_apart(time: Series, values: np.ndarray) -> Series:
     pairs = rows[(np.diff(rows, prepend=-2) > 1) & same.any(axis=1)]
     time[pairs] = np.nextafter(time[pairs], np.inf)
     return time
+
+
+def uneven(times: Sequence[Series]) -> tuple[float, int | None]:
+    """Usual interval in s of some meshes, and the first of these that has others.
+
+    Returns
+    -------
+    tuple of float and int
+        None instead of an index where all samples are that interval apart.
+    """
+    step = float(np.median(np.concatenate([np.diff(time) for time in times])))
+    off = (np.abs(np.diff(time) - step).max() > _UNEVEN * step for time in times)
+    return step, next((i for i, other in enumerate(off) if other), None)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from dfsm.data.dataset import Dataset
+from dfsm.data.windows import Windows
 from dfsm.fitting.causes import driven_by_past
 from dfsm.fitting.doubts import Doubts
 from dfsm.fitting.linear import LTI
@@ -24,7 +25,9 @@ def hidden_advice(
     """A sentence where derivatives leave most of themselves, and hidden states are what may help.
 
     They may where the past of what drives a state tells its next sample, although its value now
-    does not tell the derivative: then something in between remembers.
+    does not tell the derivative: then something in between remembers. Noise of a sensor is nothing
+    of the kind, and covers a derivative alike: it is told from windows of time over which it is
+    next to nothing.
 
     Parameters
     ----------
@@ -49,6 +52,9 @@ def hidden_advice(
     if not told or not driving:
         return []
     states = [s.name for s in settings.states if s.name not in rates]
+    told = {n: left for n, left in told.items() if n not in _noisy(told, data, settings, driving)}
+    if not told:
+        return []
     driven = set(driven_by_past(run, [*states, *driving]))
     poor = [n for n in told if n in driven]
     if not poor or driven & set(driving):
@@ -65,6 +71,20 @@ def hidden_advice(
         f"set hidden: {{}}{orders} in the configuration (HiddenSettings in Python), which fits "
         "rollouts with hidden states, and corrects these instead of what corrective names"
     ]
+
+
+def _noisy(
+    names: Iterable[str], data: Dataset, settings: FitSettings, driving: Sequence[str]
+) -> set[str]:
+    """States of whose derivatives noise or dropouts of the record are what is left.
+
+    Windows that are long enough for noise to be next to nothing are explained there.
+    """
+    order = {s.name: s.order for s in settings.states}
+    recorded = [s.rate for s in settings.states if s.rate is not None]
+    every = list(dict.fromkeys([*order, *recorded, *driving]))
+    windows = Windows([run.window(settings.start, settings.stop) for run in data], every)
+    return {n for n in names if windows.left(n, order[n], every)[0] < _MUCH**2}
 
 
 def _of_state(name: str, decisions: Sequence[Mapping[str, Any]]) -> float:

@@ -17,11 +17,10 @@ from dfsm.fitting.hidden.settings import HiddenSettings
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import Provenance
+from dfsm.numerics.time_mesh import uneven
 
 # Samples of the past from which hidden states are told, and fewest samples per parameter.
 _STARTUP, _FEWEST = 50, 20
-# Share of the usual interval by which another may differ.
-_UNEVEN = 0.05
 # A measured state that is another one late, to so small a share of its variance.
 _DELAYED, _LAGS = 1e-6, 50
 # Of what a further hidden state must gain to be no more than the data can tell.
@@ -130,15 +129,14 @@ def _startup(records: list[Trajectory], hidden: HiddenSettings) -> float:
 
 def _require_even(records: list[Trajectory]) -> None:
     """Refuse uneven times: what is told of a start, and of a step, is meant per sample."""
-    step = float(np.median(np.concatenate([np.diff(r.time) for r in records])))
-    for record in records:
-        apart = np.diff(record.time)
-        if np.abs(apart - step).max() > _UNEVEN * step:
-            raise DfsmError(
-                f"{record.where} has samples {apart.min():.6g} to {apart.max():.6g} s apart, where "
-                f"{step:.6g} s are usual: hidden states are fitted on even samples of one interval "
-                "in all runs, so resample it, or leave it out"
-            )
+    step, other = uneven([record.time for record in records])
+    if other is not None:
+        apart = np.diff(records[other].time)
+        raise DfsmError(
+            f"{records[other].where} has samples {apart.min():.6g} to {apart.max():.6g} s apart, "
+            f"where {step:.6g} s are usual: hidden states are fitted on even samples of one "
+            "interval in all runs, so resample it, or leave it out"
+        )
 
 
 def _require_enough(
