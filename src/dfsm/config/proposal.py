@@ -26,11 +26,14 @@ from dfsm.numerics.time_mesh import uneven
 # What wind engineers usually choose; only names that exist are proposed. The rate of a rotor's
 # speed is none of its states: nothing that is recorded explains how it changes.
 _SECOND_ORDER = ("PtfmSurge", "PtfmHeave", "PtfmPitch", "TTDspFA")
+_FLOATING = {"PtfmSurge", "PtfmHeave", "PtfmPitch"}
 _SPEEDS = ("GenSpeed", "RotSpeed")
 _CONTROLS = ("GenTq", "BldPitch1")
 _OUTPUTS = ("TwrBsFxt", "TwrBsMyt", "GenPwr")
 WINDS = ("RotWind", "RtVAvgxh", "Wind1VelX")
 _WITH_WIND = ("RotShearV", "RotShearH", "Wave1Elev")
+# Waves reach a floating hull before they reach the point where their elevation is told.
+_AHEAD = (2, 4, 6)
 _TURBINE = {*_SECOND_ORDER, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
 # RMS that is left of the rate of a state, and of a second derivative that nobody recorded, above
 # which a state is not to be told by derivatives alone: the latter are less sure on coarse samples.
@@ -126,6 +129,8 @@ def _of_turbine(
     features = []
     if "Wave1Elev" in disturbances and "Wave1Elev_dot" not in varying:
         features = [{"source": "Wave1Elev", "kind": "rate"}]
+    if "Wave1Elev" in disturbances and _FLOATING & set(varying):
+        features += [{"source": "Wave1Elev", "kind": "lead", "seconds": s} for s in _AHEAD]
     roles = {
         "control": [c for c in _CONTROLS if c in varying],
         "disturbance": disturbances,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from ruamel.yaml import YAML
@@ -12,6 +13,7 @@ from ruamel.yaml import YAML
 from dfsm.config.proposal import Proposal, propose
 from dfsm.core.files import check_file, write_file
 from dfsm.core.types import Array
+from dfsm.data.features import Feature
 from dfsm.data.info import ChannelInfo, describe
 from dfsm.data.readers import read_all
 from dfsm.data.trajectory import Trajectory
@@ -141,7 +143,8 @@ def fill(
     margin = _TURBINE_MARGIN if turbine else _MARGIN
     linear = "  kind: LTI\n" + margin
     if wind:
-        linear = _LPV.format(schedule=_flow(wind), margin=margin)
+        waves = _constant_waves(proposed.features)
+        linear = _LPV.format(schedule=_flow(wind), waves=waves, margin=margin)
     driving = [*proposed.disturbances, *proposed.controls]
     advice = _hidden_told(proposed)
     text = _TEXT.format(
@@ -188,6 +191,15 @@ def _varies(values: Array) -> bool:
     return len(finite) > 0 and bool(finite.min() < finite.max())
 
 
+def _constant_waves(features: Sequence[Mapping[str, Any]]) -> str:
+    """The line that keeps what waves do the same at all winds, where some of their inputs lead."""
+    leading = {f["source"] for f in features if f["kind"] == "lead"}
+    names = [Feature(**f).name for f in features if f["source"] in leading]
+    if not leading:
+        return ""
+    return f"  constant: {_flow([*sorted(leading), *names])}  # waves do the same in all winds\n"
+
+
 def _differs(name: str, runs: Sequence[Trajectory]) -> bool:
     """Whether a channel that is constant in every run is not the same in all of them."""
     starts = [r[name][0] for r in runs]
@@ -217,7 +229,7 @@ _LPV = """\
   kind: LPV           # LPV varies with the schedule; LTI does not (remove schedule, points)
   schedule: {schedule}
   points: 5
-{margin}"""
+{waves}{margin}"""
 
 _MARGIN = """\
   margin: null        # 1/s; a number keeps all eigenvalues left of -margin, at the least cost in
