@@ -186,7 +186,8 @@ def _limited(shot: Transcription, outcome: Outcome, dense: Dense) -> Iterator[_L
             held = np.zeros((layout.scenarios, layout.nodes))
             at = rows[:, :, column]
             held[:, shot.grid.own] = outcome.multipliers[at] / program.row_scale[at]
-            size = float(sizes_of(*pair, (0,)))
+            # Limits may be larger between the nodes; those at the nodes know what is rounding.
+            size = max(float(sizes_of(*pair, (0,))), float(program.row_scale[at].max()))
             jumps = bool(layout.functions.path_jumps[column])
             yield from _beyond(label, size, dense.path[..., column], pair, jumps, held)
             column += 1

@@ -20,10 +20,10 @@ from dfsm.control.nlp import constraints
 from dfsm.control.nlp.estimate import Estimate
 from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
+from dfsm.control.nlp.nodes import node_data
 from dfsm.control.nlp.program import Block, Program, Rows
 from dfsm.control.nlp.shot import Shot, check_seconds, quoted
 from dfsm.control.nlp.terms import Functions, Term, common_of, functions_of
-from dfsm.control.nlp.transcription import node_data
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array, IntArray

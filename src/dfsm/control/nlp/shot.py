@@ -15,6 +15,7 @@ from dfsm.control.mesh.grid import Grid
 from dfsm.control.nlp.estimate import Estimate
 from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
+from dfsm.control.nlp.nodes import values_along
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.terms import Functions
 from dfsm.control.problem import OptimalControlProblem
@@ -48,6 +49,10 @@ class Shot(Protocol):
     def unscaled(self, z: Array) -> Start:
         """Values at all nodes from the solver's variables."""
         ...
+
+    def at(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
+        """Outputs of the nodes' term anywhere, see `values_along`."""
+        return values_along(self.problem, self.functions, X, U, start, tau)
 
     @abstractmethod
     def estimate(self, outcome: Outcome, start: Start) -> Estimate:
