@@ -119,7 +119,13 @@ def _reason(record: Record, ending: Ending, chatter: str) -> str:
     if ending is Ending.COARSE:
         return _coarse(record)
     if ending is Ending.UNBOUNDED:
-        return runaway(program, z)
+        text = runaway(program, z)
+        # Where nodes share their slopes, what a control does at one node another one undoes, and a
+        # cost that is linear in it has no least value on the mesh.
+        names = shot.problem.plant.names("controls")
+        if shot.grid.kind == "radau" or not any(text.startswith(f"{n} runs away") for n in names):
+            return text
+        return f"{text}, which may be so on this mesh only: use scheme radau first"
     if outcome.ending == "runaway":
         return f"{runaway(program, z)}, and the objective does not fall with it"
     if ending in _EARLY:

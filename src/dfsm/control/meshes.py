@@ -34,8 +34,6 @@ _CLEARLY, _MOST_SCALE = 3.0, 1e4
 _NEAR = 1e-2
 # Tolerance of what only starts the next solve.
 _ROUGHLY = 1e-4
-# Meshes are not refined beyond this many intervals.
-_MOST_INTERVALS = 5000
 # So many meshes must together lower the largest error by this factor.
 _PATIENCE, _LESS = 3, 0.7
 # Endings that a mesh may owe to being too coarse; it is then cut so finely, up to so many starts,
@@ -47,7 +45,9 @@ _FINER, _STARTS, _MOST_COARSE = 3, 3, 300
 _LEAST_OF_BEFORE = 1e-3
 # A size below this share of where a solve went, of 1 at most, was none.
 _OUTGROWN = 1e-4
-_OUT_OF_TIME = "the time limit came before a finer mesh was solved"
+_OUT_OF_TIME = (
+    "the time limit came before a finer mesh was solved: raise most_seconds, or loosen refine"
+)
 
 
 class Record:
@@ -64,7 +64,7 @@ class Record:
     refines
         Whether errors between the nodes were to meet anything.
     why
-        Why no finer mesh was tried although one was asked for; else "".
+        Why no finer mesh was tried although one was asked for, and what to do; else "".
     tolerance, objective_scale
         Of the solver, and of the objective that it saw.
     meshes, iterations, compile, solve
@@ -253,11 +253,11 @@ def _refined(
         grid = record.shot.grid
         if record.outcome.ending not in _GOOD or history[-1][1] <= refine:
             break
-        record.why = _hopeless(history, grid.intervals, settings.until)
+        record.why = _hopeless(history, record.shot, method, settings.until)
         if record.why or round_ == method.most_refinements:
             break
         knots = knots_of(problem, record.shot.functions) if knots is None else knots
-        finer = grid.refined(record.estimate.local(refine), refine, knots)
+        finer = method.refined(grid, record.estimate.local(refine), refine, knots)
         start = replace(
             record.start,
             X=np.stack([grid.states(X, finer.tau) for X in record.start.X]),
@@ -283,16 +283,20 @@ def _shares(shot: Shot) -> tuple[Array, Array]:
     return _LEAST_OF_BEFORE * X, _LEAST_OF_BEFORE * U
 
 
-def _hopeless(history: Sequence[tuple[str, float]], intervals: int, until: float | None) -> str:
-    """Why no finer mesh is worth trying, "" while one is."""
+def _hopeless(
+    history: Sequence[tuple[str, float]], shot: Shot, method: Method, until: float | None
+) -> str:
+    """Why no finer mesh is worth trying, and what to do instead; "" while one is."""
     if until is not None and clock.perf_counter() > until:
         return _OUT_OF_TIME
-    if intervals > _MOST_INTERVALS:
-        return f"{intervals} intervals are the most that are tried"
+    instead = f"{shot.otherwise}, or loosen refine"
+    if shot.grid.intervals > method.most_intervals:
+        return f"more than {method.most_intervals} intervals are not tried: {instead}"
     if len(history) > _PATIENCE and history[-1][1] > _LESS * history[-1 - _PATIENCE][1]:
         kind, error = history[-1]
         return (
             f"{_PATIENCE} finer meshes did not lower the largest error, {error:.2g} of the {kind}"
+            f": {instead}"
         )
     return ""
 

@@ -56,12 +56,23 @@ class Shot(Protocol):
 
     @abstractmethod
     def estimate(self, outcome: Outcome, start: Start) -> Estimate:
-        """Errors between the nodes, NaN where nothing estimates them."""
+        """Errors between the nodes."""
         ...
 
     @abstractmethod
     def costates(self, multipliers: Array) -> tuple[Trajectory, ...]:
         """∂J/∂ξ per scenario, from the multipliers of the constraints in physical units."""
+        ...
+
+    @property
+    @abstractmethod
+    def otherwise(self) -> str:
+        """What to do where finer meshes do not lower the errors."""
+        ...
+
+    @abstractmethod
+    def path_rows(self) -> IntArray:
+        """Constraints that are path constraints, shape ``(scenario, own node, value)``."""
         ...
 
     @abstractmethod
@@ -96,6 +107,8 @@ class Method(Protocol):
         For all meshes together, None for no limit.
     refine, most_refinements
         Error to which meshes are refined, None where they are not, and how often.
+    most_intervals
+        Meshes are not refined beyond so many.
     """
 
     @property
@@ -110,9 +123,17 @@ class Method(Protocol):
     def refine(self) -> float | None: ...  # noqa: D102
     @property
     def most_refinements(self) -> int: ...  # noqa: D102
+    @property
+    def most_intervals(self) -> int: ...  # noqa: D102
 
     def grid(self) -> Grid:
         """The first mesh."""
+        ...
+
+    def refined(
+        self, grid: Grid, errors: Array, tolerance: float, knots: Array | None = None
+    ) -> Grid:
+        """A mesh that is finer where errors are above a tolerance, see `Grid.refined`."""
         ...
 
     def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Shot:
@@ -125,6 +146,11 @@ def quoted(sizes: dict[str, int]) -> list[str]:
     return [f"'{name}'" for name, count in sizes.items() for _ in range(count)]
 
 
-def check_seconds(limit: float | None) -> None:
-    """Refuse a time limit that is none."""
-    require(limit is None or limit > 0, "most_seconds", limit, "more than 0, or None")
+def check_limits(method: Method) -> None:
+    """Refuse tolerances and limits that are none."""
+    refine, seconds = method.refine, method.most_seconds
+    require(refine is None or refine > 0, "refine", refine, "more than 0")
+    require(method.tolerance > 0, "tolerance", method.tolerance, "more than 0")
+    require(method.most_iterations >= 1, "most_iterations", method.most_iterations, "at least 1")
+    require(method.most_refinements >= 0, "most_refinements", method.most_refinements, "0 or more")
+    require(seconds is None or seconds > 0, "most_seconds", seconds, "more than 0, or None")

@@ -22,7 +22,7 @@ from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
 from dfsm.control.nlp.nodes import local_rows, node_data
 from dfsm.control.nlp.program import Block, Program
-from dfsm.control.nlp.shot import Shot, check_seconds, quoted
+from dfsm.control.nlp.shot import Shot, check_limits, quoted
 from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.settings import require, settings_class
@@ -71,16 +71,23 @@ class DirectTranscription:
 
     def __post_init__(self) -> None:
         require(1 <= self.degree <= 12, "degree", self.degree, "1 to 12")
-        require(self.refine is None or self.refine > 0, "refine", self.refine, "more than 0")
-        require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
-        require(self.most_iterations >= 1, "most_iterations", self.most_iterations, "at least 1")
-        require(self.most_refinements >= 0, "most_refinements", self.most_refinements, "0 or more")
-        check_seconds(self.most_seconds)
+        check_limits(self)
         self.grid()
 
     def grid(self) -> Grid:
         """The first mesh."""
         return grid_of(self.scheme, self.degree, self.mesh)
+
+    @property
+    def most_intervals(self) -> int:
+        """Meshes are not refined beyond so many."""
+        return 5000
+
+    def refined(
+        self, grid: Grid, errors: Array, tolerance: float, knots: Array | None = None
+    ) -> Grid:
+        """The mesh with its intervals cut where errors are above a tolerance."""
+        return grid.refined(errors, tolerance, knots)
 
     def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Transcription:
         """The problem on a mesh; the start gives the sizes of variables without bounds."""
@@ -201,10 +208,17 @@ class Transcription(Shot):
         return estimate_of(self, outcome, start)
 
     def path_rows(self) -> IntArray:
-        """Constraints that are path constraints, shape ``(scenario, own node, value)``."""
+        """Path constraints, see `Shot`."""
         width = sum(self.functions.path_sizes.values())
         shape = (self.layout.scenarios, len(self.grid.own), width)
         return self._first_path + np.arange(np.prod(shape)).reshape(shape)
+
+    @property
+    def otherwise(self) -> str:
+        """What follows jumps and kinks better."""
+        if self.grid.kind != "radau":
+            return "use scheme radau"
+        return "replace kinks in costs and constraints by smooth functions"
 
     def row_nodes(self) -> IntArray:
         """All of them."""
