@@ -48,7 +48,8 @@ def bryson_denham(**changes) -> OptimalControlProblem:
     """Least effort below x = 1/9: the optimum is 4."""
     fields: dict[str, Any] = {"model": DOUBLE, "horizon": (0.0, 1.0), "cost": half_effort}
     fields |= {"initial": {"x": 0.0, "v": 1.0}, "final": {"x": 0.0, "v": -1.0}}
-    return OptimalControlProblem(**(fields | {"bounds": {"x": (None, 1 / 9)}} | changes))
+    fields["bounds"] = {"x": (None, 1 / 9)}
+    return OptimalControlProblem(**(fields | changes))
 
 
 def test_shooting_keeps_a_bound_between_its_nodes():

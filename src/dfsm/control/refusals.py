@@ -3,24 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
 from dfsm.control.levels import Level, is_number, level
-from dfsm.control.names import GROUPS
+from dfsm.control.names import GROUPS, Plant
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 
-if TYPE_CHECKING:
-    from dfsm.control.problem import OptimalControlProblem
+
+class Stated(Protocol):
+    """What is read of an `OptimalControlProblem`, which asks for these checks itself."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @cached_property
+    def plant(self) -> Plant: ...  # noqa: D102
+    @property
+    def horizon(self) -> tuple[float, float | tuple[float, float]]: ...  # noqa: D102
+    @property
+    def start(self) -> float: ...  # noqa: D102
+    @property
+    def last_time(self) -> float: ...  # noqa: D102
+    @property
+    def free_time(self) -> tuple[float, float] | None: ...  # noqa: D102
+    @property
+    def bounds(self) -> Mapping[str, Any]: ...  # noqa: D102
+    @property
+    def rates(self) -> Mapping[str, Any]: ...  # noqa: D102
+    @property
+    def constraints(self) -> Mapping[str, Any]: ...  # noqa: D102
+    @property
+    def parameters(self) -> Mapping[str, Any]: ...  # noqa: D102
+    @property
+    def free_parameters(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def disturbances(self) -> Any: ...  # noqa: D102
+    @cached_property
+    def scenarios(self) -> tuple[Trajectory | None, ...]: ...  # noqa: D102
+
+    def limits(self, name: str, time: Array) -> tuple[Array, Array]: ...  # noqa: D102
+
+    def end_limits(self, which: str, name: str) -> tuple[float, float]: ...  # noqa: D102
+
 
 # Fields that hold entries by name.
 _BY_NAME = ("bounds", "rates", "initial", "final", "constraints", "boundary", "parameters")
 
 
-def check_forms(problem: OptimalControlProblem) -> None:
+def check_forms(problem: Stated) -> None:
     """Refuse fields of another kind than what they are for."""
     name, runs = problem.name, problem.disturbances
     for place in _BY_NAME:
@@ -38,9 +72,9 @@ def check_forms(problem: OptimalControlProblem) -> None:
                 f"{name}: {place} is a {type(value).__name__}, expected a function of named "
                 "signals, or None"
             )
-    one = runs is None or isinstance(runs, str | Trajectory) or not isinstance(runs, Sequence)
-    given = [runs] if one else runs
-    for run in given if runs is not None else ():
+    several = isinstance(runs, Sequence) and not isinstance(runs, str)
+    given: Sequence[Any] = runs if several else () if runs is None else (runs,)
+    for run in given:
         if not isinstance(run, Trajectory):
             raise DfsmError(
                 f"{name}: disturbances hold a {type(run).__name__}, expected a Trajectory or a "
@@ -48,7 +82,7 @@ def check_forms(problem: OptimalControlProblem) -> None:
             )
 
 
-def check_names(problem: OptimalControlProblem) -> None:
+def check_names(problem: Stated) -> None:
     """Refuse names that the model does not have, and parameters without a value."""
     plant, name = problem.plant, problem.name
     places = {
@@ -82,7 +116,7 @@ def check_names(problem: OptimalControlProblem) -> None:
                 )
 
 
-def check_pairs(problem: OptimalControlProblem) -> None:
+def check_pairs(problem: Stated) -> None:
     """Refuse what is not of the form that its field asks for."""
     for place, number, limits in (
         ("bounds", False, _is_level),
@@ -117,7 +151,7 @@ def _is_level(value: object) -> bool:
     return _is_limit(value) or callable(value) or isinstance(value, Trajectory)
 
 
-def check_horizon(problem: OptimalControlProblem) -> None:
+def check_horizon(problem: Stated) -> None:
     """Refuse a horizon that does not increase, and limits that move along one that is free."""
     name, start, free = problem.name, problem.start, problem.free_time
     low, high = free or (problem.last_time, problem.last_time)
@@ -145,7 +179,7 @@ def _constant(limit: Level) -> bool:
     return limit is None or not (callable(limit) or isinstance(limit, Trajectory))
 
 
-def check_disturbances(problem: OptimalControlProblem) -> None:
+def check_disturbances(problem: Stated) -> None:
     """Refuse disturbances that are missing, too short or not finite."""
     names, name = problem.plant.names("disturbances"), problem.name
     runs = [r for r in problem.scenarios if r is not None]
@@ -164,7 +198,7 @@ def check_disturbances(problem: OptimalControlProblem) -> None:
         chosen.require_finite()
 
 
-def check_limits(problem: OptimalControlProblem) -> None:
+def check_limits(problem: Stated) -> None:
     """Refuse bounds that cross, ends outside bounds, and bounds outside the training region."""
     time = np.linspace(problem.start, problem.last_time, 201)
     for place in ("bounds", "rates", "constraints", "boundary"):
@@ -206,7 +240,7 @@ def check_limits(problem: OptimalControlProblem) -> None:
     _check_region(problem, time)
 
 
-def _check_region(problem: OptimalControlProblem, time: Array) -> None:
+def _check_region(problem: Stated, time: Array) -> None:
     plant = problem.plant
     if plant.region is None:
         return
