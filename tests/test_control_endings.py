@@ -181,6 +181,19 @@ BAD = {
         {"constraints": {"c": (lambda s: s.x.place, 1.0, 1.0)}},
         r"121 equality constraints for 119 variables leave nothing to choose",
     ),
+    "constraints without names": (
+        {"constraints": [lambda s: s.x.place]},
+        r"constraints are a list, expected a dict by name, \{name: \(function, low, high\)\}",
+    ),
+    "a cost that is a name": ({"cost": "force"}, r"cost is a str, expected a function"),
+    "a path as wind": (
+        {"disturbances": "wind.csv"},
+        r"disturbances hold a str, expected a Trajectory or a list of them",
+    ),
+    "a parameter that is no number": (
+        {"parameters": {"mass": float("nan")}},
+        r"parameter 'mass' is nan, expected a finite number, or a pair",
+    ),
     "no model": ({"model": "cart"}, r"model is a str, expected a DFSM or an ODESystem"),
 }
 

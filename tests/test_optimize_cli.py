@@ -125,6 +125,7 @@ BAD = [
     ),
     ({"cost": [{"product": ["x0"], "weight": 1}]}, "'cost[0].product' names fewer than two"),
     ({"units": {"u0": 0}}, "'units.u0' is 0, expected a number that is not 0"),
+    ({"units": {"u0": -5}}, "'units.u0' is -5, expected a number above 0"),
     ({"units": {"u1": 2}}, "'units': no channel 'u1'"),
     ({"bounds": {"x9": [0, 1]}}, "bounds: no channel 'x9'"),
     ({"bounds": {"u0": [2, 1]}}, "the lower limit must not be above the upper one"),

@@ -170,6 +170,11 @@ def cost_of(
         _owner(plant, name, "units")
         if not (np.isfinite(divisor) and divisor != 0):
             raise DfsmError(f"'units.{name}' is {divisor:g}, expected a number that is not 0")
+        if divisor < 0:
+            raise DfsmError(
+                f"'units.{name}' is {divisor:g}, expected a number above 0: a negative one turns "
+                "the sign of costs, which is what 'weight' is for"
+            )
     parts = [_factors(term, f"cost[{k}]", plant) for k, term in enumerate(terms)]
 
     def cost(s: Any) -> Any:

@@ -14,9 +14,9 @@ from dfsm.control.guess import Start
 from dfsm.control.levels import level
 from dfsm.control.meshes import Record
 from dfsm.control.nlp.ipopt import Outcome
+from dfsm.control.nlp.nodes import node_data
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.shot import Shot
-from dfsm.control.nlp.transcription import node_data
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.control.replay import replay
 from dfsm.control.solution import HELD, RATE, Ending, Solution
@@ -34,6 +34,7 @@ _ENDINGS = {
     "limit": Ending.LIMIT,
     "time": Ending.TIME,
     "unbounded": Ending.UNBOUNDED,
+    "runaway": Ending.FAILED,
     "interrupted": Ending.INTERRUPTED,
     "not finite": Ending.NOT_FINITE,
     "failed": Ending.FAILED,
@@ -118,7 +119,15 @@ def _reason(record: Record, ending: Ending, chatter: str) -> str:
     if ending is Ending.COARSE:
         return _coarse(record)
     if ending is Ending.UNBOUNDED:
-        return runaway(program, z)
+        text = runaway(program, z)
+        # Where nodes share their slopes, what a control does at one node another one undoes, and a
+        # cost that is linear in it has no least value on the mesh.
+        names = shot.problem.plant.names("controls")
+        if shot.grid.kind == "radau" or not any(text.startswith(f"{n} runs away") for n in names):
+            return text
+        return f"{text}, which may be so on this mesh only: use scheme radau first"
+    if outcome.ending == "runaway":
+        return f"{runaway(program, z)}, and the objective does not fall with it"
     if ending in _EARLY:
         return f"the optimality conditions hold to {measured.worst:.2g}"
     if ending is Ending.INACCURATE:

@@ -27,7 +27,8 @@ class Start:
     stop
         Last time in s.
     sizes
-        What a coarser mesh divided states and controls by; None before there is one.
+        What states and controls are divided by at least, where nothing else tells their sizes;
+        None before any solve did.
     """
 
     X: Array

@@ -26,21 +26,28 @@ from dfsm.models.dfsm import DFSM
 
 # Outcomes of the solver that can be built on.
 _GOOD = ("solved", "acceptable", "stalled")
+# Outcomes after which nothing else is tried.
+_NO_MORE = ("interrupted", "time")
 # Objectives that vary by less than 1, by this factor, are scaled up, by no more than the second.
 _CLEARLY, _MOST_SCALE = 3.0, 1e4
 # Scaled violations up to which a start counts as close to a solution.
 _NEAR = 1e-2
 # Tolerance of what only starts the next solve.
 _ROUGHLY = 1e-4
-# Meshes are not refined beyond this many intervals.
-_MOST_INTERVALS = 5000
 # So many meshes must together lower the largest error by this factor.
 _PATIENCE, _LESS = 3, 0.7
 # Endings that a mesh may owe to being too coarse; it is then cut so finely, up to so many starts,
 # unless it has more than so many intervals.
 _NOT_SO_FINE = ("infeasible", "failed")
 _FINER, _STARTS, _MOST_COARSE = 3, 3, 300
-_OUT_OF_TIME = "the time limit came before a finer mesh was solved"
+# A size that comes from values on a coarser mesh is no smaller than this share of the size there: a
+# state that stayed at rest is known to the tolerance only.
+_LEAST_OF_BEFORE = 1e-3
+# A size below this share of where a solve went, of 1 at most, was none.
+_OUTGROWN = 1e-4
+_OUT_OF_TIME = (
+    "the time limit came before a finer mesh was solved: raise most_seconds, or loosen refine"
+)
 
 
 class Record:
@@ -57,7 +64,7 @@ class Record:
     refines
         Whether errors between the nodes were to meet anything.
     why
-        Why no finer mesh was tried although one was asked for; else "".
+        Why no finer mesh was tried although one was asked for, and what to do; else "".
     tolerance, objective_scale
         Of the solver, and of the objective that it saw.
     meshes, iterations, compile, solve
@@ -168,7 +175,47 @@ def _from_guess(
     if isinstance(guess, Solution) and np.array_equal(guess.grid.edges, grid.edges):
         multipliers = guess.solver_state
     settings = replace(settings, warm=isinstance(guess, Solution))
-    return _on(record, method.shot(problem, grid, start), start, settings, multipliers)
+    record = _on(record, method.shot(problem, grid, start), start, settings, multipliers)
+    resized = _resized(record, start, not isinstance(guess, Solution))
+    if resized is None:
+        return record
+    before = record.shot, record.outcome, record.start, record.estimate
+    held = _holds(record) and record.outcome.iterations > 0
+    record = _on(record, method.shot(problem, grid, resized), resized, settings)
+    if held and not _holds(record) and record.outcome.ending != "unbounded":
+        record.go_back(*before)
+    return record
+
+
+def _holds(record: Record) -> bool:
+    """Whether the last outcome is a solution on its mesh."""
+    outcome = record.outcome
+    return outcome.ending in _GOOD and outcome.optimality.held(record.tolerance)
+
+
+def _resized(record: Record, start: Start, fresh: bool) -> Start | None:
+    """The start with larger sizes, where those that it gave turned out to be none; else None.
+
+    A start may be tiny with nothing beside it that says so, as where a simulation came to rest. The
+    solver then works with numbers that its tolerance does not fit: it fails, or finds at once that
+    no step matters. Sizes grow to where it went, but not beyond the 1 that a start at 0 gets, and
+    to that where a fresh start was left by no step.
+    """
+    outcome, layout = record.outcome, record.shot.layout
+    if outcome.ending in _NO_MORE:
+        return None
+    before = layout.sizes(record.shot.program.scale)
+    went = [np.nan_to_num(np.abs(v)).max(axis=(0, 1)) for v in (record.start.X, record.start.U)]
+    if fresh and outcome.iterations == 0:
+        went = [np.ones_like(v) for v in went]
+    usual = [np.minimum(v, 1.0) for v in went]
+    X, U = (np.where(b < _OUTGROWN * v, v, b) for b, v in zip(before, usual, strict=True))
+    start = replace(start, sizes=(X, U))
+    # Limits and training ranges go before what a start says.
+    resized = replace(layout, start=start)
+    after = resized.sizes(resized.scale(*resized.limits()))
+    grew = any((a > b).any() for a, b in zip(after, before, strict=True))
+    return start if grew else None
 
 
 def _on(
@@ -206,16 +253,16 @@ def _refined(
         grid = record.shot.grid
         if record.outcome.ending not in _GOOD or history[-1][1] <= refine:
             break
-        record.why = _hopeless(history, grid.intervals, settings.until)
+        record.why = _hopeless(history, record.shot, method, settings.until)
         if record.why or round_ == method.most_refinements:
             break
         knots = knots_of(problem, record.shot.functions) if knots is None else knots
-        finer = grid.refined(record.estimate.local(refine), refine, knots)
+        finer = method.refined(grid, record.estimate.local(refine), refine, knots)
         start = replace(
             record.start,
             X=np.stack([grid.states(X, finer.tau) for X in record.start.X]),
             U=np.stack([grid.controls(U, finer.tau) for U in record.start.U]),
-            sizes=record.shot.layout.sizes(record.shot.program.scale),
+            sizes=_shares(record.shot),
         )
         before = (record.shot, record.outcome, record.start, record.estimate)
         shot = method.shot(problem, finer, start)
@@ -230,16 +277,26 @@ def _refined(
     return record
 
 
-def _hopeless(history: Sequence[tuple[str, float]], intervals: int, until: float | None) -> str:
-    """Why no finer mesh is worth trying, "" while one is."""
+def _shares(shot: Shot) -> tuple[Array, Array]:
+    """What is the least of sizes on a finer mesh."""
+    X, U = shot.layout.sizes(shot.program.scale)
+    return _LEAST_OF_BEFORE * X, _LEAST_OF_BEFORE * U
+
+
+def _hopeless(
+    history: Sequence[tuple[str, float]], shot: Shot, method: Method, until: float | None
+) -> str:
+    """Why no finer mesh is worth trying, and what to do instead; "" while one is."""
     if until is not None and clock.perf_counter() > until:
         return _OUT_OF_TIME
-    if intervals > _MOST_INTERVALS:
-        return f"{intervals} intervals are the most that are tried"
+    instead = f"{shot.otherwise}, or loosen refine"
+    if shot.grid.intervals > method.most_intervals:
+        return f"more than {method.most_intervals} intervals are not tried: {instead}"
     if len(history) > _PATIENCE and history[-1][1] > _LESS * history[-1 - _PATIENCE][1]:
         kind, error = history[-1]
         return (
             f"{_PATIENCE} finer meshes did not lower the largest error, {error:.2g} of the {kind}"
+            f": {instead}"
         )
     return ""
 
@@ -270,7 +327,7 @@ def _solve_scaled(
     """
     scale = program.objective_scale
     first = _solve_once(program, z, settings, multipliers)
-    if settings.warm and first.ending not in (*_GOOD, "interrupted", "time"):
+    if settings.warm and first.ending not in (*_GOOD, *_NO_MORE):
         # What looked close was not: start afresh from the same point.
         first = _solve_once(program, z, replace(settings, warm=False), None)
     if first.ending == "failed" and program.linear_quadratic:

@@ -19,10 +19,15 @@ from dfsm.errors import printable
 RATE = "rate of "
 # Scaled optimality conditions that hold to this count as held, or to the tolerance if that is more.
 HELD = 1e-6
+# What helps whatever keeps errors above those asked for.
+_LOOSEN = "loosen refine"
 
 
 class Ending(enum.Enum):
-    """How a solve ended; the value says what it means and what to do."""
+    """How a solve ended; the value says what it means and what to do.
+
+    What to do about `COARSE` depends on why no finer mesh helped: `Solution.message` says it.
+    """
 
     SOLVED = "solved"
     ACCEPTABLE = (
@@ -39,7 +44,7 @@ class Ending(enum.Enum):
     )
     COARSE = (
         "the optimality conditions hold on the last mesh, whose errors between the nodes are still "
-        "above what was asked: raise most_refinements, or loosen refine"
+        "above what was asked"
     )
     CHATTERING = (
         "not solved, a control jumps to and fro from node to node where the cost cannot tell it "
@@ -191,7 +196,8 @@ class Solution(Drawn):
         ∫ |L| dt + |M|; ``constraints``, the largest excess over a limit, over its size (that
         of a limit on controls, which may jump, is integrated over normalised time); ``objective``,
         how far the objective is from the optimum, which these three make, over the same as the
-        cost. NaN without an estimate (shooting), empty for a solution of an earlier version.
+        cost (NaN for shooting, whose controls stay linear between the nodes of a mesh that nothing
+        refines for their sake). Empty for a solution of an earlier version, whose shooting has NaN.
     """
 
     name: str
@@ -240,7 +246,10 @@ class Solution(Drawn):
     @property
     def message(self) -> str:
         """One sentence on the outcome."""
-        return f"{self.reason}; {self.ending.value}" if self.reason else self.ending.value
+        text = f"{self.reason}; {self.ending.value}" if self.reason else self.ending.value
+        # The reason says what to do where more meshes would not have helped.
+        more = self.ending is Ending.COARSE and _LOOSEN not in self.reason
+        return f"{text}: raise most_refinements, or {_LOOSEN}" if more else text
 
     def at(self, tau: Array, scenario: int = 0) -> tuple[Array, Array]:
         """States and controls between the nodes, by the scheme's polynomials.

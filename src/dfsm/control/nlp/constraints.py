@@ -12,7 +12,7 @@ from scipy import sparse
 
 from dfsm.control.levels import level
 from dfsm.control.mesh.grid import Grid
-from dfsm.control.nlp.layout import Layout
+from dfsm.control.nlp.layout import ROUNDING, Layout
 from dfsm.control.nlp.program import Block, Program, Rows
 from dfsm.core.types import Array, IntArray
 
@@ -169,7 +169,8 @@ def path(layout: Layout, nodes: IntArray, source: IntArray) -> Part:
             times = np.tile(time, layout.scenarios)
             rows.append(Rows(label, index[:, :, column].ravel(), times))
             column += 1
-    size = np.broadcast_to(sizes_of(low, high, (0, 1)), shape).ravel()
+    seen = np.abs(layout.along[..., 1 + layout.functions.nx :])
+    size = np.broadcast_to(sizes_of(low, high, (0, 1), seen.max(axis=(0, 1))), shape).ravel()
     node = entries(index, source[:, :, None] + np.arange(width), 1.0)
     return Part(low.ravel(), high.ravel(), size, rows, node=node)
 
@@ -191,7 +192,8 @@ def boundary(layout: Layout, outputs: int) -> Part:
         rows.append(Rows(name, at_rows, np.full(len(at_rows), np.nan)))
         column += count
     source = np.arange(layout.scenarios)[:, None] * outputs + 1 + np.arange(shape[1])
-    size = np.broadcast_to(sizes_of(low, high, (0,)), shape).ravel()
+    seen = np.abs(layout.ends_along[:, 1:]).max(axis=0)
+    size = np.broadcast_to(sizes_of(low, high, (0,), seen), shape).ravel()
     return Part(low.ravel(), high.ravel(), size, rows, ends=entries(index, source, 1.0))
 
 
@@ -226,10 +228,13 @@ def rates(layout: Layout, scale: Array) -> list[Part]:
     return parts
 
 
-def sizes_of(low: Array, high: Array, axes: tuple[int, ...]) -> Array:
-    """Sizes of constraints: the largest finite limit over some axes, 1 where that is 0."""
+def sizes_of(low: Array, high: Array, axes: tuple[int, ...], seen: Array | float = 0.0) -> Array:
+    """Sizes of constraints: the largest finite limit over some axes, 1 where that is 0.
+
+    `seen` are the largest values along the start: a limit that is rounding beside them is a 0.
+    """
     largest = np.maximum(_finite(low), _finite(high)).max(axis=axes, initial=0.0)
-    return np.where(largest > 0, largest, 1.0)
+    return np.where(largest > ROUNDING * seen, largest, 1.0)
 
 
 def _finite(limits: Array) -> Array:

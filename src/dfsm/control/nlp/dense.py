@@ -33,6 +33,8 @@ class Dense:
         States, their slopes with τ and controls, shape ``(scenario, interval, point, n)``.
     values
         Outputs of the nodes' term, [T L, T ẋ, path constraints].
+    weights
+        Of a quadrature over the unit interval at the points, shape ``(point,)``.
     """
 
     grid: Grid
@@ -42,6 +44,7 @@ class Dense:
     slope: Array
     U: Array
     values: Array
+    weights: Array
 
     @property
     def cost(self) -> Array:
@@ -60,7 +63,7 @@ class Dense:
 
     def integral(self, values: Array) -> Array:
         """Over every interval in τ, from ``(…, interval, point)``."""
-        return (values @ self.grid.checked[1]) * self.grid.lengths
+        return (values @ self.weights) * self.grid.lengths
 
 
 def dense_of(shot: Transcription, z: Array, start: Start) -> Dense:
@@ -84,7 +87,7 @@ def dense_of(shot: Transcription, z: Array, start: Start) -> Dense:
     )
     time = shot.problem.start + tau * (start.stop - shot.problem.start)
     shape = (*X.shape[:3], values.shape[-1])
-    return Dense(grid, tau, time, X, dX, U, values.reshape(shape))
+    return Dense(grid, tau, time, X, dX, U, values.reshape(shape), grid.checked[1])
 
 
 def costates_at(shot: Transcription, multipliers: Array) -> Array:

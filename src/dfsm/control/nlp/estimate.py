@@ -30,6 +30,7 @@ from dfsm.control.nlp.program import Program
 from dfsm.core.types import Array
 
 if TYPE_CHECKING:
+    from dfsm.control.nlp.shot import Shot
     from dfsm.control.nlp.transcription import Transcription
 
 # Objectives smaller than this are not told from 0: see the largest scale of `meshes`.
@@ -45,9 +46,9 @@ class Estimate:
     Attributes
     ----------
     dynamics, cost, constraints
-        Of every interval, shape ``(interval,)``, see the module; NaN where nothing estimates them.
+        Of every interval, shape ``(interval,)``, see the module.
     objective
-        Relative error of the objective; NaN where nothing estimates it.
+        Relative error of the objective; NaN where nothing estimates it (shooting).
     exceeded
         Which limit is exceeded most between the nodes, by how much, and when; "" for none.
     """
@@ -57,12 +58,6 @@ class Estimate:
     constraints: Array
     objective: float
     exceeded: str = ""
-
-    @classmethod
-    def unknown(cls, intervals: int) -> Estimate:
-        """No estimate."""
-        none = np.full(intervals, np.nan)
-        return cls(none, none, none, np.nan)
 
     @property
     def errors(self) -> dict[str, float]:
@@ -88,7 +83,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class _Limited:
+class Limited:
     """Something with limits, between the nodes.
 
     Attributes
@@ -123,21 +118,25 @@ def estimate_of(shot: Transcription, outcome: Outcome, start: Start) -> Estimate
     z = outcome.z
     with np.errstate(all="ignore"):  # a function may not be defined between the nodes
         dense = dense_of(shot, z, start)
-        gaps = _finite(dense.slopes - dense.slope)[..., shot.layout.solved]
-        size = np.maximum(
-            np.abs(start.X).max(axis=(0, 1)), 1e-3 * shot.layout.sizes(shot.program.scale)[0]
-        )
+        gaps = finite(dense.slopes - dense.slope)[..., shot.layout.solved]
+        size = state_sizes(shot, start)
         missing = dense.integral(np.abs(np.moveaxis(gaps, -1, 0)))
         dynamics = (missing / size[shot.layout.solved, None, None]).max(axis=(0, 1), initial=0.0)
         cost = _cost_gaps(shot, z, dense)
-        whole = _objective_size(shot, z, dense)
-        limited = list(_limited(shot, outcome, dense))
-        constraints, exceeded = _worst(dense, limited)
+        whole = objective_size(shot, z, dense)
+        limited = list(limited_of(shot, outcome, dense))
+        constraints, exceeded = worst_of(dense, limited)
         objective = _objective(shot, outcome, start, dense, (gaps, cost), limited)
     return Estimate(dynamics, np.abs(cost) / whole, constraints, objective / whole, exceeded)
 
 
-def _finite(values: Array) -> Array:
+def state_sizes(shot: Shot, start: Start) -> Array:
+    """What errors of states are relative to, shape ``(state,)``."""
+    scale = shot.layout.sizes(shot.program.scale)[0]
+    return np.maximum(np.abs(start.X).max(axis=(0, 1)), 1e-3 * scale)
+
+
+def finite(values: Array) -> Array:
     """Values, infinite where they are not numbers."""
     return np.where(np.isnan(values), np.inf, values)
 
@@ -147,10 +146,10 @@ def _cost_gaps(shot: Transcription, z: Array, dense: Dense) -> Array:
     grid, weights = shot.grid, shot.problem.scenario_weights
     nodes = shot.program.outputs(z)[0].reshape(len(weights), len(grid.tau), -1)[..., 0]
     seen = (nodes[:, grid.local] @ grid.scheme.weights) * grid.lengths
-    return weights @ (dense.integral(_finite(dense.cost)) - seen)
+    return weights @ (dense.integral(finite(dense.cost)) - seen)
 
 
-def _objective_size(shot: Transcription, z: Array, dense: Dense) -> float:
+def objective_size(shot: Shot, z: Array, dense: Dense) -> float:
     """∫ |L| + |M|, which cancellation does not make small."""
     final = abs(float(shot.program.blocks[1].c @ shot.program.outputs(z)[1].ravel()))
     parts = shot.problem.scenario_weights @ dense.integral(np.abs(dense.cost))
@@ -158,7 +157,7 @@ def _objective_size(shot: Transcription, z: Array, dense: Dense) -> float:
     return max(total if np.isfinite(total) else 0.0, _LEAST)
 
 
-def _limited(shot: Transcription, outcome: Outcome, dense: Dense) -> Iterator[_Limited]:
+def limited_of(shot: Shot, outcome: Outcome, dense: Dense) -> Iterator[Limited]:
     """All that has limits."""
     layout, program, problem = shot.layout, shot.program, shot.problem
     x, u, _ = layout.columns
@@ -171,8 +170,10 @@ def _limited(shot: Transcription, outcome: Outcome, dense: Dense) -> Iterator[_L
             pair = layout.channel_limits(name, time)
             at = columns[:, :, i]
             jumps = group == "controls"
-            size = float(program.scale[at].max())
-            held = np.where(program.lower[at] < program.upper[at], bound[at], 0.0)
+            # States inside the segments of shooting are no variables.
+            own = at >= 0
+            size = float(program.scale[at[own]].max())
+            held = np.where(own & (program.lower[at] < program.upper[at]), bound[at], 0.0)
             yield from _beyond(name, size, values[..., i], pair, jumps, held)
     column = 0
     rows = shot.path_rows() if layout.functions.path_sizes else np.empty((0, 0, 0), dtype=int)
@@ -186,7 +187,8 @@ def _limited(shot: Transcription, outcome: Outcome, dense: Dense) -> Iterator[_L
             held = np.zeros((layout.scenarios, layout.nodes))
             at = rows[:, :, column]
             held[:, shot.grid.own] = outcome.multipliers[at] / program.row_scale[at]
-            size = float(sizes_of(*pair, (0,)))
+            # Limits may be larger between the nodes; those at the nodes know what is rounding.
+            size = max(float(sizes_of(*pair, (0,))), float(program.row_scale[at].max()))
             jumps = bool(layout.functions.path_jumps[column])
             yield from _beyond(label, size, dense.path[..., column], pair, jumps, held)
             column += 1
@@ -194,14 +196,14 @@ def _limited(shot: Transcription, outcome: Outcome, dense: Dense) -> Iterator[_L
 
 def _beyond(
     name: str, size: float, values: Array, pair: tuple[Array, Array], jumps: bool, held: Array
-) -> Iterator[_Limited]:
+) -> Iterator[Limited]:
     low, high = (limit.reshape(values.shape[1:]) for limit in pair)
     if np.isfinite(low).any() or np.isfinite(high).any():
         excess = np.maximum(np.maximum(low - values, values - high), 0.0)
-        yield _Limited(name, size, _finite(excess), jumps, held)
+        yield Limited(name, size, finite(excess), jumps, held)
 
 
-def _worst(dense: Dense, limited: list[_Limited]) -> tuple[Array, str]:
+def worst_of(dense: Dense, limited: list[Limited]) -> tuple[Array, str]:
     """The largest relative excess of every interval, and the worst limit in words."""
     intervals = dense.grid.intervals
     most, exceeded, total = 0.0, "", np.zeros(intervals)
@@ -227,7 +229,7 @@ def _objective(
     start: Start,
     dense: Dense,
     gaps: tuple[Array, Array],
-    limited: list[_Limited],
+    limited: list[Limited],
 ) -> float:
     """Distance of the objective from the optimum, in its unit."""
     costates = costates_at(shot, outcome.multipliers / shot.program.row_scale)

@@ -50,7 +50,8 @@ class Outcome:
         Of scaled constraints and of scaled variables.
     ending
         ``"solved"``, ``"acceptable"``, ``"stalled"``, ``"infeasible"``, ``"limit"``, ``"time"``,
-        ``"unbounded"``, ``"interrupted"``, ``"not finite"`` or ``"failed"``: what the solver says.
+        ``"unbounded"``, ``"interrupted"``, ``"not finite"`` or ``"failed"``: what the solver says;
+        ``"runaway"`` where variables run away and the objective does not fall.
     optimality
         How well the conditions hold at `z`: what is measured.
     iterations
@@ -142,6 +143,8 @@ def solve_nlp(
     if ending == "failed" and measured.held(settings.tolerance):
         # It gives up, too, where rounding lets no step improve a point that is a solution.
         ending = "stalled"
+    if ending == "unbounded" and not _fell(program, start, z):
+        ending = "runaway"
     if ending in _BEST and watch.best is not None:
         point = watch.best
         measured = optimality(program, *point)
@@ -158,6 +161,13 @@ def _require_freedom(program: Program) -> None:
             "choose: turn a path or boundary equality into limits, free an end, or use more "
             "intervals"
         )
+
+
+def _fell(program: Program, start: Array, z: Array) -> bool:
+    """Whether the objective is lower than at the start by more than its value there."""
+    with np.errstate(all="ignore"):  # where variables run away, a function need not be finite
+        before, after = program.cost(start), program.cost(z)
+    return bool(after < before - abs(before))
 
 
 def _ending(word: str) -> str:

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from dfsm.control.guess import Start
+from dfsm.control.nlp.nodes import values_along
 from dfsm.control.nlp.program import Rows
-from dfsm.control.nlp.terms import Functions
+from dfsm.control.nlp.terms import Functions, common_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Channel, Trajectory
@@ -18,9 +19,9 @@ from dfsm.errors import DfsmError
 
 # Limits from here on mean that there is none.
 _NONE = 1e15
-# A size that comes from values on a coarser mesh is no smaller than this share of the size there: a
-# state that stayed at rest is known to the tolerance only.
-_LEAST_OF_BEFORE = 1e-3
+# Values that are smaller than this share of how far the same thing moves are what rounding left of
+# a 0, and say nothing of its size: a start at sin π, or a state at which a simulation came to rest.
+ROUNDING = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,26 @@ class Layout:
         """Times of the nodes in s; for a free last time those of the start."""
         # There all limits are constant, so that any times serve.
         return self.problem.start + self.tau * (self.start.stop - self.problem.start)
+
+    @cached_property
+    def along(self) -> Array:
+        """Outputs of the nodes' term along the start, see `values_along`; 0 where not finite."""
+        with np.errstate(all="ignore"):  # what is not finite is told when the solve begins
+            values = values_along(
+                self.problem, self.functions, self.start.X, self.start.U, self.start, self.tau
+            )
+        return np.where(np.isfinite(values), values, 0.0)
+
+    @cached_property
+    def ends_along(self) -> Array:
+        """Outputs of the ends' term at the start, ``(scenario, output)``; 0 where not finite."""
+        X, shared = self.start.X, [*self.start.p, *([self.start.stop] if self.free_time else [])]
+        local = np.concatenate([X[:, 0], X[:, -1], np.tile(shared, (len(X), 1))], axis=1)
+        with np.errstate(all="ignore"):
+            values = self.functions.ends.values(
+                local, {"scenario": np.arange(len(X))}, common_of(self.problem)
+            )
+        return np.where(np.isfinite(values), values, 0.0)
 
     @cached_property
     def solved(self) -> IntArray:
@@ -205,37 +226,51 @@ class Layout:
         return low, high
 
     def scale(self, low: Array, high: Array) -> Array:
-        """Sizes of all variables: half the range of the bounds, of the training, or the start's."""
+        """Sizes of all variables: half the range of the bounds, of the training, or the start's.
+
+        What the start says of a state counts unless it is rounding beside how far the slopes along
+        the start would take that state: then the state gets the smaller of that way and 1, and 1
+        where there is neither.
+        """
         x, u, q = self.columns
         scale = np.ones(self.count)
         plant = self.problem.plant
-        before = self.start.sizes or (np.zeros(x.shape[2]), np.zeros(u.shape[2]))
+        least = self.start.sizes or (np.zeros(x.shape[2]), np.zeros(u.shape[2]))
         for group, columns, values, nodes, sizes in (
-            ("states", x, self.start.X, self.state_nodes, before[0]),
-            ("controls", u, self.start.U, self.control_nodes, before[1]),
+            ("states", x, self.start.X, self.state_nodes, least[0]),
+            ("controls", u, self.start.U, self.control_nodes, least[1]),
         ):
             for i, name in enumerate(plant.names(group)):
                 at = columns[:, nodes, i]
                 # The ends may be fixed: look at the whole course.
                 half = (high[at].max() - low[at].min()) / 2
-                most = float(np.abs(values[..., i]).max())
-                scale[at] = self._size(name, half, max(most, _LEAST_OF_BEFORE * sizes[i]))
+                told = self._told(name, half)
+                if told == 0:
+                    # The solver starts within the limits, so that one side alone may tell.
+                    seen = values[..., i], np.clip(values[:, nodes, i], low[at], high[at])
+                    most = max(*(float(np.abs(v).max()) for v in seen), float(sizes[i]))
+                    way = self._way(i) if group == "states" and most > 0 else 0.0
+                    told = min(way, 1.0) if most < ROUNDING * way else most or 1.0
+                scale[at] = told
         for at, name, value in zip(q, self.problem.free_parameters, self.start.p, strict=False):
-            scale[at] = self._size(name, float(high[at] - low[at]) / 2, abs(value))
+            scale[at] = self._told(name, float(high[at] - low[at]) / 2) or abs(value) or 1.0
         if self.free_time:
             scale[q[-1]] = self.start.stop - self.problem.start
         return scale
 
-    def _size(self, name: str, half: float, guess: float) -> float:
+    def _told(self, name: str, half: float) -> float:
+        """Size that limits or the training range give, 0 for none."""
         if 0 < half < np.inf:
             return float(half)
         region = self.problem.plant.region
         if region is not None:
             i = self.problem.plant.order.column(name)
-            spread = float(region.high[i] - region.low[i]) / 2
-            if spread > 0:
-                return spread
-        return guess if guess > 0 else 1.0
+            return max(float(region.high[i] - region.low[i]) / 2, 0.0)
+        return 0.0
+
+    def _way(self, i: int) -> float:
+        """How far the slopes along the start take a state, ∫ |ẋ| dt."""
+        return float(np.trapezoid(np.abs(self.along[..., 1 + i]), self.tau, axis=1).max())
 
     def sizes(self, scale: Array) -> tuple[Array, Array]:
         """Of states and controls, ``(n,)``, from those of all variables."""

@@ -15,6 +15,7 @@ from dfsm.control.mesh.grid import Grid
 from dfsm.control.nlp.estimate import Estimate
 from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
+from dfsm.control.nlp.nodes import values_along
 from dfsm.control.nlp.program import Program
 from dfsm.control.nlp.terms import Functions
 from dfsm.control.problem import OptimalControlProblem
@@ -49,14 +50,29 @@ class Shot(Protocol):
         """Values at all nodes from the solver's variables."""
         ...
 
+    def at(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
+        """Outputs of the nodes' term anywhere, see `values_along`."""
+        return values_along(self.problem, self.functions, X, U, start, tau)
+
     @abstractmethod
     def estimate(self, outcome: Outcome, start: Start) -> Estimate:
-        """Errors between the nodes, NaN where nothing estimates them."""
+        """Errors between the nodes."""
         ...
 
     @abstractmethod
     def costates(self, multipliers: Array) -> tuple[Trajectory, ...]:
         """∂J/∂ξ per scenario, from the multipliers of the constraints in physical units."""
+        ...
+
+    @property
+    @abstractmethod
+    def otherwise(self) -> str:
+        """What to do where finer meshes do not lower the errors."""
+        ...
+
+    @abstractmethod
+    def path_rows(self) -> IntArray:
+        """Constraints that are path constraints, shape ``(scenario, own node, value)``."""
         ...
 
     @abstractmethod
@@ -91,6 +107,8 @@ class Method(Protocol):
         For all meshes together, None for no limit.
     refine, most_refinements
         Error to which meshes are refined, None where they are not, and how often.
+    most_intervals
+        Meshes are not refined beyond so many.
     """
 
     @property
@@ -105,9 +123,17 @@ class Method(Protocol):
     def refine(self) -> float | None: ...  # noqa: D102
     @property
     def most_refinements(self) -> int: ...  # noqa: D102
+    @property
+    def most_intervals(self) -> int: ...  # noqa: D102
 
     def grid(self) -> Grid:
         """The first mesh."""
+        ...
+
+    def refined(
+        self, grid: Grid, errors: Array, tolerance: float, knots: Array | None = None
+    ) -> Grid:
+        """A mesh that is finer where errors are above a tolerance, see `Grid.refined`."""
         ...
 
     def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Shot:
@@ -120,6 +146,11 @@ def quoted(sizes: dict[str, int]) -> list[str]:
     return [f"'{name}'" for name, count in sizes.items() for _ in range(count)]
 
 
-def check_seconds(limit: float | None) -> None:
-    """Refuse a time limit that is none."""
-    require(limit is None or limit > 0, "most_seconds", limit, "more than 0, or None")
+def check_limits(method: Method) -> None:
+    """Refuse tolerances and limits that are none."""
+    refine, seconds = method.refine, method.most_seconds
+    require(refine is None or refine > 0, "refine", refine, "more than 0")
+    require(method.tolerance > 0, "tolerance", method.tolerance, "more than 0")
+    require(method.most_iterations >= 1, "most_iterations", method.most_iterations, "at least 1")
+    require(method.most_refinements >= 0, "most_refinements", method.most_refinements, "0 or more")
+    require(seconds is None or seconds > 0, "most_seconds", seconds, "more than 0, or None")

@@ -10,11 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from dfsm.control.between import disturbances_at
 from dfsm.control.guess import Start
 from dfsm.control.mesh.grid import Grid, grid_of
 from dfsm.control.mesh.schemes import Kind
@@ -22,8 +20,9 @@ from dfsm.control.nlp import constraints
 from dfsm.control.nlp.estimate import Estimate, estimate_of
 from dfsm.control.nlp.ipopt import Outcome
 from dfsm.control.nlp.layout import Layout
+from dfsm.control.nlp.nodes import local_rows, node_data
 from dfsm.control.nlp.program import Block, Program
-from dfsm.control.nlp.shot import Shot, check_seconds, quoted
+from dfsm.control.nlp.shot import Shot, check_limits, quoted
 from dfsm.control.nlp.terms import common_of, functions_of
 from dfsm.control.problem import OptimalControlProblem
 from dfsm.core.settings import require, settings_class
@@ -72,16 +71,23 @@ class DirectTranscription:
 
     def __post_init__(self) -> None:
         require(1 <= self.degree <= 12, "degree", self.degree, "1 to 12")
-        require(self.refine is None or self.refine > 0, "refine", self.refine, "more than 0")
-        require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
-        require(self.most_iterations >= 1, "most_iterations", self.most_iterations, "at least 1")
-        require(self.most_refinements >= 0, "most_refinements", self.most_refinements, "0 or more")
-        check_seconds(self.most_seconds)
+        check_limits(self)
         self.grid()
 
     def grid(self) -> Grid:
         """The first mesh."""
         return grid_of(self.scheme, self.degree, self.mesh)
+
+    @property
+    def most_intervals(self) -> int:
+        """Meshes are not refined beyond so many."""
+        return 5000
+
+    def refined(
+        self, grid: Grid, errors: Array, tolerance: float, knots: Array | None = None
+    ) -> Grid:
+        """The mesh with its intervals cut where errors are above a tolerance."""
+        return grid.refined(errors, tolerance, knots)
 
     def shot(self, problem: OptimalControlProblem, grid: Grid, start: Start) -> Transcription:
         """The problem on a mesh; the start gives the sizes of variables without bounds."""
@@ -182,27 +188,6 @@ class Transcription(Shot):
             values, tau = values[:, :, -1:], grid.edges[:-1] + grid.lengths / 2
         return tau, values.reshape(layout.scenarios, -1, states)
 
-    def at(self, X: Array, U: Array, start: Start, tau: Array) -> Array:
-        """Outputs of the nodes' term anywhere: [T L, T ẋ, path constraints].
-
-        Parameters
-        ----------
-        X, U
-            States and controls at the same times, shape ``(scenario, time, n)``.
-        start
-            Holds the free parameters and the last time.
-        tau
-            Normalised times, shape ``(time,)``.
-
-        Returns
-        -------
-        ndarray
-            Shape ``(scenario, time, output)``.
-        """
-        local, data = self._local(X, U, start, tau)
-        values = self.functions.node.values(local, data, self.common)
-        return values.reshape(*X.shape[:2], -1)
-
     def in_controls(
         self, X: Array, U: Array, start: Start, tau: Array, weights: Array
     ) -> tuple[Array, Array]:
@@ -210,7 +195,7 @@ class Transcription(Shot):
 
         `weights` has the shape of what `at` returns, what comes back that of `U`.
         """
-        local, data = self._local(X, U, start, tau)
+        local, data = local_rows(self.problem, X, U, start, tau)
         node, common = self.functions.node, self.common
         flat = weights.reshape(len(local), -1)
         own = np.arange(X.shape[2], X.shape[2] + U.shape[2])
@@ -218,23 +203,22 @@ class Transcription(Shot):
         curve = np.diagonal(node.hessian(local, data, common, flat, own), axis1=1, axis2=2)
         return slope.reshape(U.shape), curve.reshape(U.shape)
 
-    def _local(self, X: Array, U: Array, start: Start, tau: Array) -> tuple[Array, dict[str, Any]]:
-        """Local vectors and data of the nodes' term, row by row."""
-        time = self.problem.start + tau * (start.stop - self.problem.start)
-        shared = [*start.p, *([start.stop] if self.layout.free_time else [])]
-        rows = (*X.shape[:2], len(shared))
-        local = np.concatenate([X, U, np.broadcast_to(shared, rows)], axis=2)
-        return local.reshape(-1, local.shape[2]), node_data(self.problem, tau, time)
-
     def estimate(self, outcome: Outcome, start: Start) -> Estimate:
         """Errors between the nodes, see `nlp.estimate`."""
         return estimate_of(self, outcome, start)
 
     def path_rows(self) -> IntArray:
-        """Constraints that are path constraints, shape ``(scenario, own node, value)``."""
+        """Path constraints, see `Shot`."""
         width = sum(self.functions.path_sizes.values())
         shape = (self.layout.scenarios, len(self.grid.own), width)
         return self._first_path + np.arange(np.prod(shape)).reshape(shape)
+
+    @property
+    def otherwise(self) -> str:
+        """What follows jumps and kinks better."""
+        if self.grid.kind != "radau":
+            return "use scheme radau"
+        return "replace kinks in costs and constraints by smooth functions"
 
     def row_nodes(self) -> IntArray:
         """All of them."""
@@ -245,18 +229,3 @@ class Transcription(Shot):
         states = self.functions.plant.names("states")
         slopes = [f"the derivative of '{n}'" for n in states]
         return ["the cost", *slopes, *quoted(self.functions.path_sizes)]
-
-
-def node_data(problem: OptimalControlProblem, tau: Array, time: Array) -> dict[str, Any]:
-    """Time and disturbances of every node of every scenario."""
-    names = problem.plant.names("disturbances")
-    count, kinds = len(problem.scenarios), problem.between[len(problem.plant.names("controls")) :]
-    w = np.zeros((count, len(tau), len(names)))
-    for s, run in enumerate(problem.scenarios):
-        if run is not None:
-            w[s] = disturbances_at(run, names, kinds, time, problem.last_time - problem.start)
-    return {
-        "tau": np.tile(tau, count),
-        "scenario": np.repeat(np.arange(count), len(tau)),
-        "w": w.reshape(count * len(tau), len(names)),
-    }
