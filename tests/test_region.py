@@ -32,6 +32,7 @@ SETTINGS = FitSettings(
     linear=LTI(),
     corrective=NoCorrection(),
     nonlinear_only=False,
+    inputs="linear",  # though Euler's rule holds them
 )
 
 

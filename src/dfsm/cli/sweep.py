@@ -44,7 +44,8 @@ def sweep(
     with working(quiet), hushed():
         found = loaded(asked, config.parent)
         sources = [config, *(run.source for run in found.runs)]
-        check_spared([output / _TABLE], config.parent / asked.model, found.model, sources)
+        kept = [output / _TABLE] if (output / _TABLE).exists() else []
+        check_spared(kept, config.parent / asked.model, found.model, sources)
         controllers = gain_grid(found.controller, asked.gains, found.discon)
         swept = run_sweep(
             found.model,
