@@ -1,8 +1,8 @@
 """Run the measurements and print one JSON object.
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
-    [unseen] [limits] [intervals] [matched] [control] [codesign] [loops] [tuning] [exports] [sysid]
-    [peer] [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
+    [unseen] [waves] [limits] [intervals] [matched] [control] [codesign] [loops] [tuning] [exports]
+    [sysid] [peer] [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
 
 Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER`` for published
 records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
@@ -51,6 +51,7 @@ from benchmarks import (
     sysid,
     tuning,
     unseen,
+    waves,
 )
 from dfsm.core.files import json_value
 
@@ -67,6 +68,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "scaling": scaling.run,
     "rollouts": rollouts.run,
     "unseen": unseen.run,
+    "waves": waves.run,
     "limits": limits.run,
     "intervals": intervals.run,
     "matched": matched.run,
@@ -114,6 +116,7 @@ def main() -> None:
         figures[name] = PARTS[name](*told.get(name, ()))
         tables = {
             "intervals": intervals.intervals_table,
+            "waves": waves.waves_table,
             "startup": startup.startup_table,
             "memory": memory.memory_table,
             "install": install.install_table,

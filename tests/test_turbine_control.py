@@ -12,9 +12,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import turbine_control
 from benchmarks import scheduled
 from benchmarks.accuracy import bundled, demo
-from dfsm.control import load_solution, save_solution
+from dfsm.control import Ending, load_solution, save_solution
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.fit import fit
@@ -144,6 +145,29 @@ def test_an_optimum_that_keeps_a_tighter_limit_is_not_sought_again(region: Regio
         highest = r.solution.bounds[PITCH][1].max()
         inside = min(r.most_pitch, float(region.model.region.high[pitch]))
         assert highest == (inside if r.case.inside else r.most_pitch)
+
+
+def test_an_optimum_within_a_limit_stands_for_a_wider_one_where_none_was_found(
+    region: Region, monkeypatch
+):
+    calls = []
+
+    def first_fails(*arguments):
+        result = optimize(*arguments)
+        calls.append(arguments[3])
+        if len(calls) == 1:
+            failed = replace(result.solution, ending=Ending.LIMIT)
+            return replace(result, solution=failed)
+        return result
+
+    monkeypatch.setattr(turbine_control, "optimize", first_fails)
+    size = ControlStudySettings(points=60, pitch_limits=(30.0, 20.0))
+    loose, tighter, *_ = study([region], size).results
+    assert calls[:2] == [30.0, 20.0]
+    assert loose.solution.solved
+    assert loose.run is tighter.run
+    assert loose.solution.bounds[PITCH][1].max() == 30.0
+    assert tighter.solution.bounds[PITCH][1].max() == 20.0
 
 
 def test_the_best_power_coefficient_is_that_of_steady_wind_or_of_a_training_run(region: Region):

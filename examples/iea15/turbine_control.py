@@ -40,6 +40,8 @@ from turbine_problem import (
 
 # Intervals of the mesh for each of the coarser one that an optimum inside the data starts from.
 _COARSER = 4
+# Degrees by which a platform pitch stays clear of a limit that it does not come to.
+_CLEAR = 0.01
 # What counts as "at the peak" of the platform pitch: this share of the horizon.
 _PEAK = 0.05
 
@@ -275,25 +277,31 @@ def _limits(
 ) -> list[Result]:
     """Results for all limits of the platform pitch, as they stand in `settings`.
 
-    Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too.
+    Where an optimum keeps a tighter limit by itself, it is that limit's optimum, too. One that does
+    not come to its limit is an optimum of wider limits, too, where the solver found none.
     """
     results: dict[float, Result] = {}
     last = None
     for limit in sorted(settings.pitch_limits, reverse=True):
         if last is not None and last.solution.solved and last.run[PITCH].max() < limit:
-            last = _tighter(last, limit)
+            low, high = last.solution.bounds[PITCH]
+            last = _as_of(last, limit, np.stack([low, np.minimum(high, limit)]))
         else:
             last = optimize(region, wind, case, limit, settings)
         results[limit] = last
+    for limit, result in results.items():
+        for other in () if result.solution.solved else list(results.values()):
+            room = min(other.most_pitch, limit) - _CLEAR
+            if other.solution.solved and other.run[PITCH].max() < room:
+                results[limit] = _as_of(other, limit, result.solution.bounds[PITCH])
     return [results[limit] for limit in settings.pitch_limits]
 
 
-def _tighter(result: Result, limit: float) -> Result:
-    """The same result as that of a limit which it keeps."""
+def _as_of(result: Result, limit: float, bounds: Array) -> Result:
+    """The same result as that of another limit which it keeps."""
     solution = result.solution
-    low, high = solution.bounds[PITCH]
-    bounds = {**solution.bounds, PITCH: np.stack([low, np.minimum(high, limit)])}
-    return replace(result, most_pitch=limit, solution=replace(solution, bounds=bounds))
+    solution = replace(solution, bounds={**solution.bounds, PITCH: bounds})
+    return replace(result, most_pitch=limit, solution=solution)
 
 
 def steady_gains(model: DFSM, wind: float) -> tuple[float, float]:
