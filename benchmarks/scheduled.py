@@ -25,6 +25,7 @@ REFINEMENT = replace(
         *("Wave1Elev", "Wave1Elev_dot"),
     ),
     network=16,
+    iterations=15,
 )
 BELOW_RATED = "06"
 

@@ -102,7 +102,7 @@ def settings(
 REFINEMENT = dfsm.RefineSettings(
     windows=(20.0, None),
     step=0.5,
-    iterations=15,
+    iterations=10,
     latents=8,
     latent_inputs=(
         *("RotWind", "RotShearV", "RotShearH", "Wave1Elev", "Wave1Elev_dot"),

@@ -206,6 +206,7 @@ def optimize(
         refine=None,
         tolerance=settings.tolerance,
         stay_inside=case.inside,
+        most_iterations=1000,
     )
     guess = None
     if case.inside:
