@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import runpy
 import shutil
 import struct
 from collections.abc import Callable, Mapping
@@ -14,12 +15,16 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
+from scipy.io import savemat
 
 from benchmarks.outb import outb_bytes
 from dfsm.config.control import ControlConfig
 from dfsm.config.fit import parse_candidates, parse_config
 from dfsm.config.parse import parse_file
+from dfsm.config.sweep import load_sweep
+from dfsm.config.tune import load_tuning
 from dfsm.control.solution_folder import load_solution, save_solution
+from dfsm.controllers.rosco import read_rosco
 from dfsm.core.bundle import MANIFEST, checksum, signed
 from dfsm.core.files import json_bytes
 from dfsm.core.types import Array
@@ -80,7 +85,7 @@ class Sample:
 
 def samples(folder: Path, kind: str | None = None) -> dict[str, Sample]:
     """One input per kind, made in a folder; where one kind is named, perhaps not all."""
-    made = [*_tables(folder), *_texts(folder)]
+    made = [*_tables(folder), *_texts(folder), *_loops(folder)]
     # These take longest to make.
     if kind is None or kind.startswith(("model", "solution")):
         made += _folders(folder)
@@ -113,6 +118,9 @@ def _tables(folder: Path) -> list[Sample]:
     found.append(_file("field.bts", wind_field(), _wind, folder))
     found.append(_file("gust.wnd", _GUST, _uniform, folder))
     found.append(_bladed(run, folder))
+    found.append(_hawc2(run, folder))
+    savemat(folder / "run.mat", {"time": run.time, **{n: run[n] for n in run.names}})
+    found.append(_file("run.mat", (folder / "run.mat").read_bytes(), _said, folder))
     found.append(_file("rotor.txt", _rotor(), lambda p: read_rotor_table(p).cp.tolist(), folder))
     return found
 
@@ -154,6 +162,26 @@ def _bladed(run: Trajectory, folder: Path) -> Sample:
 
     raw = "\r\n".join(head).encode()
     return Sample("run.%25", raw, put, _said, _said(put(raw, folder)), checked=False)
+
+
+def _hawc2(run: Trajectory, folder: Path) -> Sample:
+    """A .sel of HAWC2, with binary samples beside it that stay as they are."""
+    table = np.column_stack([run.time, run.values])
+    scales = np.abs(table).max(axis=0) / 32000
+    head = ["Version ID : HAWC2 12.9", "Time : 10:00", "Date : 1", "Result file : a.dat", "", ""]
+    head += ["Scans Channels Time Format", f"{len(run)} 4 {0.05 * len(run):.3f} BINARY", "", "", ""]
+    for k, (name, unit) in enumerate([("Time", "s"), *((c.name, c.unit) for c in run.channels)]):
+        head.append(f"{k + 1:>7}     {name:<31}{unit:<11}{name} of a run")
+    head += ["Scale factors:", *(f"{s:.5E}" for s in scales), ""]
+
+    def put(damaged: bytes, where: Path) -> Path:
+        np.rint(table / scales).T.astype("<i2").tofile(where / "damaged.dat")
+        path = where / "damaged.sel"
+        path.write_bytes(damaged)
+        return path
+
+    raw = "\r\n".join(head).encode()
+    return Sample("run.sel", raw, put, _said, _said(put(raw, folder)), checked=False)
 
 
 def _out(run: Trajectory) -> bytes:
@@ -282,6 +310,31 @@ def _texts(folder: Path) -> list[Sample]:
             sign=_signed,
         ),
         _file("result.json", json_bytes(signed(result)), _result, folder, True, _signed),
+    ]
+
+
+# -- closed loops ---------------------------------------------------------------------------------
+
+_LOOPS = """\
+model: m
+controller: DISCON.IN
+runs: ["runs/*.outb"]
+"""
+_TUNE = """\
+parameters: {omega_pc: [0.12, 0.35], Kp_float: [-14.0, -4.0]}
+objective: [{measure: damage, channel: y, exponent: 4}, {measure: std, channel: q, weight: 0.5}]
+"""
+_SWEEP = "weights: {mean: 9.5}\ngains: {omega_pc: [0.15, 0.2]}\npower: P\nextremes: [y]\n"
+
+
+def _loops(folder: Path) -> list[Sample]:
+    """What closed loops are asked for with: the rotor's table of the deck stays as it is."""
+    path = Path(__file__).parents[1] / "tests" / "decks.py"
+    deck = runpy.run_path(str(path))["write_deck"](folder).read_bytes()
+    return [
+        _file("deck.IN", deck, lambda p: repr(read_rosco(p, interval=0.05).parameters), folder),
+        _file("tune.yaml", (_LOOPS + _TUNE).encode(), lambda p: repr(load_tuning(p)), folder),
+        _file("sweep.yaml", (_LOOPS + _SWEEP).encode(), lambda p: repr(load_sweep(p)), folder),
     ]
 
 

@@ -240,7 +240,8 @@ def damaged(tmp_path_factory):
 
 KINDS = {
     **dict.fromkeys(("run.csv", "run.parquet", "packed.parquet", "run.out", "run.outb"), 60),
-    **dict.fromkeys(("gust.wnd", "run.%25"), 60),
+    **dict.fromkeys(("gust.wnd", "run.%25", "run.sel", "run.mat"), 60),
+    **{"deck.IN": 40, "tune.yaml": 20, "sweep.yaml": 20},
     **dict.fromkeys(("run.lvm", "toa5.csv", "commas.csv"), 40),
     **dict.fromkeys(("field.bts", "rotor.txt", "times.json", "intervals.json", "result.json"), 60),
     **{"config.yaml": 12, "problem.yaml": 30},
