@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,8 @@ def _other(rng: np.random.Generator, tree: Any) -> Any:
             case 2 if isinstance(node[key], int | float) and not isinstance(node[key], bool):
                 node[key] = node[key] * int(rng.choice([-1, 2, 1000])) + int(rng.integers(-1, 2))
             case _:
-                node[key] = _VALUES[int(rng.integers(len(_VALUES)))]
+                # Its own, or what is damaged next damages the list.
+                node[key] = deepcopy(_VALUES[int(rng.integers(len(_VALUES)))])
     return tree
 
 
