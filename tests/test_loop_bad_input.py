@@ -344,3 +344,14 @@ def test_a_step_that_jax_cannot_follow_is_told_with_a_cure(model):
     law = _Decides(kp=1.0, ki=0.0, setpoint=0.0, **NAMES)
     with pytest.raises(DfsmError, match=r"step fails with Tracer.*jnp.where in place of if"):
         dfsm.closed_loop(model, run_of(model), law, settings=AT_ONCE)
+
+
+def test_a_measurement_that_is_misspelt_names_what_was_meant():
+    model = linear_model(-np.eye(1), np.ones((1, 1)), names=["GenSpeed"])
+    law = PID(
+        kp=0.4, ki=0.1, setpoint=0.2, measurements=["Genspeed"], measurement_units=["m"],
+        commands=["u0"], command_units=["N"], interval=0.1,
+    )  # fmt: skip
+    run = driving_run(model, TIME, 0 * TIME[:, None], np.ones((len(TIME), 1)), "run")
+    with pytest.raises(DfsmError, match=r"does not have; did you mean 'GenSpeed'\?: fit it with"):
+        dfsm.closed_loop(model, run, law, settings=AT_ONCE)

@@ -183,9 +183,11 @@ def _not_measured(name: str, signal: str, model: DFSM) -> DfsmError:
     states = model.signals.names("states")
     second = [s.name for s in model.signals.specs if s.order == 2]
     stand_in = f"{second[0]}{_RATE}{_RATE}" if second else f"{states[0]}{_RATE}"
+    close = near_matches(name, _signals(model))
+    meant = f"; {close}" if close.startswith("did you mean") else ""
     return DfsmError(
-        f"the controller measures '{name}', which the model does not have: fit it with '{name}' "
-        "among its outputs, or name a signal of the model that stands for it, as in "
+        f"the controller measures '{name}', which the model does not have{meant}: fit it with "
+        f"'{name}' among its outputs, or name a signal of the model that stands for it, as in "
         f"measurements={{'{name}': '{stand_in}'}} ({stand_in} is the derivative of the state "
         f"{stand_in.removesuffix(_RATE)})"
     )
