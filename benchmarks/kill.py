@@ -152,6 +152,7 @@ def killed_everywhere(
         Number of events, and one sentence per thing that went wrong.
     """
     wrong: list[str] = []
+    untouched = _everything(source)
     with tempfile.TemporaryDirectory() as base:
         whole = Path(base) / "whole"
         shutil.copytree(source, whole, symlinks=True)
@@ -176,7 +177,7 @@ def killed_everywhere(
             if full and (done.code != 2 or done.err.count("\n") > 1):
                 wrong.append(f"event {at}: exit {done.code}, {done.err[-300:]!r}")
             # It ended undisturbed in a folder without anything left behind.
-            if not full and _everything(folder) != _everything(source):
+            if not full and _everything(folder) != untouched:
                 again = attempt(folder, _NEVER, False)
                 left = sorted(p.name for p in folder.rglob(".*dfsm-*"))
                 if again.code not in (0, 1) or left:

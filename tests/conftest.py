@@ -25,8 +25,10 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.outb import write_outb
 from dfsm import cli
+from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
 from systems import DUFFING
 
 CONFIG: dict[str, Any] = {
@@ -104,6 +106,14 @@ class Peaks:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Peaks())
+
+
+def sentence(path: Path, step: float | None = None) -> str:
+    """The one sentence with which a file is refused."""
+    with pytest.raises(DfsmError) as caught:
+        read(path, step)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def resident() -> int:

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
-from conftest import Dfsm
+from conftest import Dfsm, sentence
 from dfsm.data.readers import read
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
@@ -32,13 +32,6 @@ def out_rows(count: int = 40) -> list[str]:
 def out(path: Path, units: str = "(s)\t(deg)\t(kN-m)", rows: list[str] | None = None, **put_as):
     lines = [*HEAD, units, *(out_rows() if rows is None else rows)]
     return read(put(path, "\n".join(lines) + put_as.pop("end", "\n"), **put_as))
-
-
-def sentence(path: Path) -> str:
-    with pytest.raises(DfsmError) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 # -- OpenFAST's text ----------------------------------------------------------------------------

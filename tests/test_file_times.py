@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
+from conftest import sentence
 from dfsm.data.readers import read
 from dfsm.errors import DfsmError
 
@@ -36,13 +37,6 @@ def saved(folder: Path, kind: str, columns: dict[str, Any]) -> Path:
 def put(path: Path, lines: list[str]) -> Path:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
-
-
-def sentence(path: Path, step: float | None = None) -> str:
-    with pytest.raises(DfsmError) as caught:
-        read(path, step)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 # -- names --------------------------------------------------------------------------------------
@@ -186,6 +180,14 @@ def test_stated_units_are_believed(tmp_path):
     rows = [f"{t / 86400!r},{i}" for i, t in enumerate((TIME + 50).tolist())]
     run = read(put(tmp_path / "c.csv", ["Time [days],x", *rows]))
     np.testing.assert_allclose(run.time, TIME + 50, rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["UTC", "local", "CET"])
+def test_a_zone_behind_the_name_of_dates_is_no_unit(tmp_path, unit):
+    rows = [f"{1.7e9 + t!r},{i}" for i, t in enumerate(TIME.tolist())]
+    run = read(put(tmp_path / "a.csv", [f"Timestamp [{unit}],x", *rows]))
+    np.testing.assert_array_equal(run.time, TIME)
+    assert any("counts seconds since 1970" in note for note in run.notes)
 
 
 # -- dates, stamps, durations -------------------------------------------------------------------

@@ -8,16 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from conftest import sentence
 from dfsm.data.readers import read
-from dfsm.errors import DfsmError
-
-
-def sentence(path: Path) -> str:
-    with pytest.raises(DfsmError) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
 
 # -- .sel and .dat ------------------------------------------------------------------------------
 

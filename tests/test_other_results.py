@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from conftest import Dfsm
+from conftest import Dfsm, sentence
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
 from dfsm.data.readers.uniform import UniformSettings, is_uniform, read_uniform
@@ -18,13 +18,6 @@ from dfsm.data.wind_field import with_field_wind
 from dfsm.errors import DfsmError, DfsmWarning
 
 TIME = 0.05 * np.arange(30)
-
-
-def sentence(path: Path) -> str:
-    with pytest.raises(DfsmError) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 # -- Bladed -------------------------------------------------------------------------------------

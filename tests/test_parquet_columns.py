@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from decimal import Decimal
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,21 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from conftest import sentence
 from dfsm.data.readers import read
-from dfsm.errors import DfsmError
 
 TIME = 0.1 * np.arange(30)
 
 
 def frame(**columns: object) -> pd.DataFrame:
     return pd.DataFrame({"Time [s]": TIME, "Power [kW]": np.cos(TIME), **columns})
-
-
-def sentence(path: Path) -> str:
-    with pytest.raises(DfsmError) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["str", "category", "object"])

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from conftest import sentence
 from dfsm.data.readers import read
 from dfsm.data.readers.text import number
-from dfsm.errors import DfsmError
 
 TIME = 0.5 * np.arange(40)
 A, B = np.round(np.sin(TIME), 4), np.round(1000 * (1.5 + np.cos(TIME)), 1)
@@ -20,13 +20,6 @@ def put(path: Path, lines: list[str] | str) -> Path:
     text = lines if isinstance(lines, str) else "\n".join(lines) + "\n"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def sentence(path: Path, step: float | None = None) -> str:
-    with pytest.raises(DfsmError) as caught:
-        read(path, step)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def whole(path: Path) -> tuple[str, ...]:

@@ -93,7 +93,7 @@ def seconds_of(name: str, unit: str, time: Array) -> tuple[Array, str]:
     Parameters
     ----------
     name, unit
-        Of the column; a unit that the file states is believed.
+        Of the column; a unit of time that the file states is believed, others say nothing of it.
     time
         As they stand there, shape ``(time,)``.
 
@@ -104,8 +104,10 @@ def seconds_of(name: str, unit: str, time: Array) -> tuple[Array, str]:
         in another unit; else as they are.
     """
     finite = bool(len(time)) and bool(np.isfinite(time).all())
-    if unit.lower() not in SECONDS:
-        size = factor(unit, "s") or np.nan
+    size = 1.0 if unit.lower() in SECONDS else factor(unit, "s")
+    if size is None:
+        unit = ""  # a time zone, say, behind the name of dates
+    elif size != 1.0:
         for whose, (first, last) in _DAYS.items() if size == _DAY and finite else ():
             if first <= time.min() and time.max() < last:
                 return _of_days(name, whose, time, dated=True)
