@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,25 @@ def _events() -> System:
     return System({"A": -0.7, "B": 1.0}, _record(twins, x=states, u=u), settings)
 
 
+def _blows() -> System:
+    time = np.arange(0, 200, 0.2)
+    u, rng = _sines(time), np.random.default_rng(5)
+    for first in rng.choice(np.arange(20, 980, 20), 8, replace=False):
+        u[first : first + 2] += 30.0
+    # Steps of RK4 within lines from sample to sample miss nothing.
+    x, fine = [0.5], 20
+    for a, b in pairwise(u):
+        now, h = x[-1], 0.2 / fine
+        for k in range(fine):
+            first, middle, last = (a + (b - a) * (k + part) / fine for part in (0, 0.5, 1))
+            k1 = -0.4 * now + first
+            k2 = -0.4 * (now + h / 2 * k1) + middle
+            k3 = -0.4 * (now + h / 2 * k2) + middle
+            now += h / 6 * (k1 + 2 * k2 + 2 * k3 - 0.4 * (now + h * k3) + last)
+        x.append(now)
+    return System({"A": -0.4, "B": 1.0}, _record(time, x=np.array(x), u=u))
+
+
 def _decay() -> System:
     time = np.arange(0, 100, 0.1)
     slopes = np.array([[0.0, 1.0], [-0.05, -0.03]])
@@ -161,6 +181,7 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "the same with the delay as a feature": _delay_told,
     "a controller against an unknown force": _closed_loop,
     "two samples at every event": _events,
+    "eight hammer blows on a smooth force": _blows,
     "free decay, no input": _decay,
     "an integrator": _integrator,
     "a noisy input": _noisy_input,

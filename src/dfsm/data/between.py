@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 
 from dfsm.core.types import Array, IntArray
 from dfsm.data.trajectory import Trajectory
@@ -34,6 +35,10 @@ _GOES_ON = 0.35
 _TURNS, _FAST, _FEWEST = 0.5, 0.15, 30
 # A slow signal that is rounded stays and moves by one unit of its rounding, over so many levels.
 _ROUNDED = 20
+# A line between two samples is an event that rises so many times as much as those beside it, as
+# those of the whole record, and over such a share of the range; so many intervals on each side are
+# beside it, and more events than such a share of the intervals are how the input is.
+_SUDDEN, _MATTERS, _BESIDE, _FEW = 12.0, 0.02, 8, 0.1
 
 
 def is_held(values: Array) -> bool:
@@ -189,8 +194,36 @@ def parse_chosen(text: str | None) -> Chosen:
     return by_name if all(named) else parts[0][2].strip()  # pyright: ignore[reportReturnType]
 
 
-def jumps(run: Trajectory, names: Sequence[str], kinds: Sequence[Between]) -> IntArray:
-    """Samples at which an input has jumped since the one before, increasing.
+def events(time: Array, values: Array) -> IntArray:
+    """Intervals over which an otherwise smooth input moves suddenly: a hammer's blow, a trip.
+
+    Parameters
+    ----------
+    time
+        Samples in s, ``(sample,)``.
+    values
+        The input there, ``(sample,)``.
+
+    Returns
+    -------
+    ndarray
+        Each by its first sample, increasing; none where two samples stand for one instant.
+    """
+    apart = np.flatnonzero(~same_instant(time))
+    moves = np.abs(np.diff(values))[apart]
+    rises = moves / np.diff(time)[apart]
+    if len(apart) <= 2 * _BESIDE or not rises.any():
+        return np.empty(0, dtype=np.intp)
+    large = rises > _SUDDEN * np.median(rises[rises > 0])
+    found = np.flatnonzero(large & (moves > _MATTERS * np.ptp(values)))
+    around = np.pad(rises, _BESIDE, mode="reflect")
+    beside = np.median(sliding_window_view(around, 2 * _BESIDE + 1)[found], axis=1)
+    found = found[rises[found] > _SUDDEN * beside]
+    return apart[found] if len(found) <= _FEW * len(apart) else apart[:0]
+
+
+def kinks(run: Trajectory, names: Sequence[str], kinds: Sequence[Between]) -> IntArray:
+    """Samples at which states have a kink, for an input does something sudden there; increasing.
 
     Parameters
     ----------
@@ -198,11 +231,18 @@ def jumps(run: Trajectory, names: Sequence[str], kinds: Sequence[Between]) -> In
         The whole record.
     names, kinds
         Its inputs, and what they do between samples: held ones jump at samples, all may jump
-        between two samples at one instant.
+        between two samples at one instant, and `events` of those joined by lines begin and end at
+        samples.
     """
-    moved = np.diff(run.select(names).values, axis=0) != 0
+    values = run.select(names).values
+    moved = np.diff(values, axis=0) != 0
     moved[~same_instant(run.time)] &= np.array([kind == "hold" for kind in kinds], dtype=bool)
-    return np.flatnonzero(moved.any(axis=1)) + 1
+    found = [np.flatnonzero(moved.any(axis=1)) + 1]
+    for column, kind in zip(values.T, kinds, strict=True):
+        if kind == "linear":
+            first = events(run.time, column)
+            found += [first, first + 1]
+    return np.unique(np.concatenate(found))
 
 
 def polynomials(time: Array, values: Array, kinds: Sequence[Between]) -> Array:

@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 
 from dfsm.data.dataset import Dataset
 from dfsm.data.rates import wrong_rates
-from dfsm.errors import DfsmError, hushed
+from dfsm.errors import DfsmError
 from dfsm.fitting.contraction import contraction
 from dfsm.fitting.doubts import Doubts
 from dfsm.fitting.records import data_warnings
+from dfsm.fitting.rollout_gate import tried_rollouts
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.fitting.verdicts import Evidence, verdicts
 from dfsm.models.dfsm import DFSM
 from dfsm.models.stability import Growth, growths, places
-from dfsm.simulation.simulate import Status, simulate
+from dfsm.simulation.simulate import Status
 
-# Training runs that are simulated to check a new model, and those of them along which pairs of
-# rollouts from different initial states are followed.
-_CHECK_RUNS, _PAIRED_RUNS = 8, 3
+# Training runs along which pairs of rollouts from different initial states are followed.
+_PAIRED_RUNS = 3
 # Samples at which a model is evaluated together.
 _TOGETHER = 2**16
 # A growth is the plant's own where so little of all rows is left over, and where it is so many
@@ -72,10 +72,8 @@ def check(
             f"the {what} is unstable at {places(unstable, model.schedule)} (fastest growth "
             f"{max(g.rate for g in unstable):.3g} 1/s): {cure}"
         )
-    tried = np.unique(np.linspace(0, len(data) - 1, _CHECK_RUNS).astype(int)).tolist()
-    some = [data[i] for i in tried]
-    with hushed():
-        rollouts = simulate(model, some, start=settings.start, stop=settings.stop)
+    tried = tried_rollouts(model, data, settings)
+    some, rollouts = [data[i] for i in tried], list(tried.values())
     done = sum(r.status is Status.COMPLETED for r in rollouts)
     checks = [f"{done} of {len(some)} training runs tried were simulated to their end"]
     if done < len(some):
@@ -90,7 +88,7 @@ def check(
         if outcome.unexpected:
             notes.append(f"{outcome.account}, although {_unexpected(model)}")
     evidence = Evidence(
-        rollouts=dict(zip(tried, rollouts, strict=True)),
+        rollouts=tried,
         doubts=None if doubt.outdated else doubt,
         growths=growing,
         refined=doubt.outdated,

@@ -42,6 +42,7 @@ from dfsm.fitting.over_intervals import over_intervals
 from dfsm.fitting.passing import fit_passing, unexplained
 from dfsm.fitting.records import held_records
 from dfsm.fitting.region import region_of
+from dfsm.fitting.rollout_gate import harm_in_rollouts
 from dfsm.fitting.rollout_samples import along_rollouts, with_latents
 from dfsm.fitting.rough_inputs import inputs_told
 from dfsm.fitting.samples import Samples, extract, select
@@ -155,6 +156,11 @@ def fit(
     if wakes := wakes_of(settings.terms):
         model = with_wakes(model, wakes, samples.inputs)
         recorded = seen = with_latents(model, data, samples, settings)
+    if model.e is not None:
+        with _timed(seconds, "rollouts with and without correction"):
+            harm = harm_in_rollouts(model, data, recorded, settings)
+        if harm:
+            model, e = replace(model, e=None, corrected=()), e.withdrawn(harm)
     discarded: list[str] = []
     learned: list[str] = []
     if hidden is not None:

@@ -64,24 +64,28 @@ def _held(samples: Samples) -> list[int]:
     return held_unseen(lambda: samples.blocks(states, driving))
 
 
-def inputs_told(samples: Samples, settings: FitSettings) -> tuple[str, ...]:
-    """Which inputs were recognised as held, and what to set where they are not."""
+def inputs_told(samples: Samples, settings: FitSettings) -> list[str]:
+    """Which inputs were recognised as held or sudden, and what to set where they are not."""
     names = samples.signals.driving
-    rough = tuple(
+    told = [
         f"{name} turns at nearly every sample: taken for lines, interval by interval (if it does "
         f"something else in between, set inputs: {{{name}: hold}} or cubic)"
         for name in samples.rough
-    )
+    ]
+    told += [
+        f"{name} moves suddenly over {count} interval{'s' * (count > 1)} between samples: "
+        "derivatives are taken between these"
+        for name, count in samples.sudden
+    ]
     chosen = settings.inputs or {}
     if isinstance(chosen, str):
-        return rough
+        return told
     kinds = zip(names, samples.signals.between, strict=True)
     held = [name for name, kind in kinds if kind == "hold" and name not in chosen]
-    if not held:
-        return rough
-    which = ", ".join(held)
-    return (
-        *rough,
-        f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
-        f"samples (for lines set inputs: {{{held[0]}: linear}})",
-    )
+    if held:
+        which = ", ".join(held)
+        told.append(
+            f"{which} stay{'s' * (len(held) == 1)} and jump{'s' * (len(held) == 1)}: held between "
+            f"samples (for lines set inputs: {{{held[0]}: linear}})"
+        )
+    return told

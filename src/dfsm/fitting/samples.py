@@ -12,7 +12,8 @@ from dfsm.core.progress import track
 from dfsm.core.types import Array, IntArray
 from dfsm.data.between import (
     Between,
-    jumps,
+    events,
+    kinks,
     polynomials,
     recognised,
     resolved,
@@ -46,7 +47,7 @@ from dfsm.models.signals import (
     with_computed,
 )
 from dfsm.models.terms import Terms, terms_of
-from dfsm.numerics.time_mesh import parts_of, same_instant, weights_over_time
+from dfsm.numerics.time_mesh import parts_of, weights_over_time
 
 # Share by which the recorded azimuth may turn faster or slower than the speed says.
 _SAME_SPEED = 0.05
@@ -81,6 +82,8 @@ class Samples:
     rough
         Names of inputs that are joined by lines and turn at nearly every sample: states have a kink
         at each, as under held ones.
+    sudden
+        Other inputs joined by lines that move suddenly, and how often; see `events`.
     """
 
     inputs: Array
@@ -96,6 +99,7 @@ class Samples:
     weights: Array | None = None
     steps: tuple[Steps, ...] = ()
     rough: tuple[str, ...] = ()
+    sudden: tuple[tuple[str, int], ...] = ()
 
     @property
     def outputs(self) -> Array:
@@ -242,14 +246,15 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         "hold" if n in rough else kind
         for n, kind in zip(signals.driving, signals.between, strict=True)
     ]
-    kinked = "hold" in bends or any(same_instant(run.time).any() for run in data)
+    used = [lead_in(run, settings.start, settings.derivatives) for run in data]
+    breaks = [kinks(run, signals.driving, bends) for run in used]
+    kinked = any(map(len, breaks))
     tables, times, begin = _places(data, settings), list[Array](), 0
     recorded: list[Array] = []
     labels: tuple[tuple[str, str], ...] = ()
-    for whole_run in track(data, "derivatives"):
-        run = lead_in(whole_run, settings.start, settings.derivatives)
-        breaks = jumps(run, signals.driving, bends)
-        extracted = differentiate(run, settings.states, settings.derivatives, breaks)
+    for k, whole_run in enumerate(track(data, "derivatives")):
+        run = used[k]
+        extracted = differentiate(run, settings.states, settings.derivatives, breaks[k])
         labels = tuple(zip(extracted.derivative_names, extracted.derivative_units, strict=True))
         whole = extracted.trajectory
         inside = whole.window(*settings.window_of(whole_run))
@@ -286,7 +291,17 @@ def extract(data: Dataset, settings: FitSettings) -> Samples:
         weights=weights_over_time(times),
         steps=tuple(steps),
         rough=rough,
+        sudden=_sudden(used, signals.driving, bends),
     )
+
+
+def _sudden(
+    runs: Sequence[Trajectory], names: Sequence[str], kinds: Sequence[Between]
+) -> tuple[tuple[str, int], ...]:
+    """Inputs joined by lines that move suddenly, and how often."""
+    lines = [name for name, kind in zip(names, kinds, strict=True) if kind == "linear"]
+    counts = [(name, sum(len(events(run.time, run[name])) for run in runs)) for name in lines]
+    return tuple((name, count) for name, count in counts if count)
 
 
 def _columns(run: Trajectory, names: Sequence[str]) -> Array:

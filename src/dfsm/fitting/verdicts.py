@@ -12,19 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.core.types import Array
 from dfsm.fitting.doubts import Doubts
+from dfsm.fitting.rollout_gate import relative_error
 from dfsm.fitting.samples import Samples
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.stability import Growth
-from dfsm.numerics.time_mesh import std_over
 from dfsm.simulation.simulate import Simulation, Status
 
 # Error of a rollout over the standard deviation of the record. At 0.3 a curve lies on the other but
 # for detail, at 0.7 half of the variance is explained.
 USABLE, TRENDS = 0.3, 0.7
-# A channel that moves by less than this share of its overall spread in a run has no error there.
-_MOVES = 0.01
 
 
 def grade(error: float | None) -> str:
@@ -91,7 +88,7 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
     ended = [s for s in evidence.rollouts.values() if s.status is not Status.COMPLETED]
     entries = []
     for name, values in recorded.items():
-        error = None if ended else _error(name, values, samples, evidence.rollouts)
+        error = None if ended else relative_error(name, values, samples, evidence.rollouts)
         if error is not None and not np.isfinite(error):
             continue
         runs = f"{len(evidence.rollouts)} training run{'s' * (len(evidence.rollouts) > 1)}"
@@ -114,20 +111,6 @@ def verdicts(samples: Samples, settings: FitSettings, evidence: Evidence) -> lis
         entry = {"name": name, "nrmse": error, "verdict": verdict, "text": text}
         entries.append(entry | {"doubt": doubt is not None})
     return entries
-
-
-def _error(name: str, values: Array, samples: Samples, rollouts: Mapping[int, Simulation]) -> float:
-    """Mean over the runs of the relative error; NaN where the channel moves in none."""
-    errors, whole = [], std_over(values, None)
-    for run, rollout in rollouts.items():
-        time, truth = samples.times[run], values[samples.parts[run]]
-        weight = np.gradient(time)
-        weight /= weight.sum()
-        spread = float(np.sqrt(weight @ (truth - weight @ truth) ** 2))
-        off = np.interp(time, rollout.trajectory.time, rollout.trajectory[name]) - truth
-        if spread > _MOVES * whole:
-            errors.append(float(np.sqrt(weight @ off**2)) / spread)
-    return float(np.mean(errors)) if errors else float("nan")
 
 
 def _doubt(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, str] | None:

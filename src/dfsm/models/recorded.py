@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dfsm.core.types import Array
-from dfsm.data.between import jumps, polynomials
+from dfsm.data.between import kinks, polynomials
 from dfsm.data.derivatives import Differentiated, differentiate, lead_in
 from dfsm.data.steps import Steps
 from dfsm.data.trajectory import Trajectory
@@ -84,7 +84,7 @@ def recorded_states(model: DFSM, run: Trajectory, start: float | None = None) ->
         return Recorded(Differentiated(run, (), none, (), (), (), np.zeros(0, bool)), None, None)
     run = lead_in(run, start, s.derivatives)
     kinds = s.between_samples()
-    breaks = jumps(run, s.driving, kinds[: len(s.driving)])
+    breaks = kinks(run, s.driving, kinds[: len(s.driving)])
     found = differentiate(run, s.specs, s.derivatives, breaks)
     if found.direct.all() or s.latents:
         return Recorded(found, None, None)

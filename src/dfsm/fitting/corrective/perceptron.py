@@ -75,7 +75,7 @@ def _train(data: TrainingSet, settings: MLP, seed: int) -> CorrectiveFit:
     def typical(step: Step) -> float:
         return _typical(squares(step.weights), held.runs)
 
-    best = _promising(sizes, train, settings, seed, typical)
+    before, best = _promising(sizes, train, settings, seed, typical)
     error, taken = typical(best), 0
     for count, step in _steps(sizes, best, train, settings, settings.iterations):
         now = typical(step)
@@ -97,21 +97,21 @@ def _train(data: TrainingSet, settings: MLP, seed: int) -> CorrectiveFit:
     return CorrectiveFit(
         function=function,
         explained=1 - squares(best.weights).mean(0) / held.targets.var(0),
-        detail=f"{'-'.join(map(str, sizes))} tanh network, {taken} training steps",
+        detail=f"{'-'.join(map(str, sizes))} tanh network, {before + taken} training steps",
     )
 
 
 def _promising(
     sizes: Sizes, train: TrainingSet, settings: MLP, seed: int, error: Callable[[Step], float]
-) -> Step:
-    """Best of a few random starts after a few steps each: some lead nowhere."""
-    found: list[tuple[float, int, Step]] = []
+) -> tuple[int, Step]:
+    """Best of a few random starts after a few steps each, some lead nowhere; and how many."""
+    found: list[tuple[float, int, int, Step]] = []
     for k in range(_STARTS):
         start = Step(_start(sizes, seed * _STARTS + k), _FIRST_DAMPING)
-        found.append((error(start), len(found), start))
-        for _, step in _steps(sizes, start, train, settings, min(_TRIAL, settings.iterations)):
-            found.append((error(step), len(found), step))
-    return min(found)[2]
+        found.append((error(start), len(found), 0, start))
+        for count, step in _steps(sizes, start, train, settings, min(_TRIAL, settings.iterations)):
+            found.append((error(step), len(found), count, step))
+    return min(found)[2:]
 
 
 def _typical(squares: Array, runs: IntArray) -> float:
