@@ -232,10 +232,16 @@ def test_a_lead_is_what_comes(tmp_path):
     assert abs(row["w_lead1.5"] - 1) < 2e-3
     assert abs(row["w"]) < 2e-3
     save(model, tmp_path / "m")
-    rollout = simulate(load(tmp_path / "m"), led(6)).trajectory
+    loaded, run = load(tmp_path / "m"), led(6)
+    outcome = simulate(loaded, run)
+    assert outcome.message.endswith("leading inputs hold their last value for the last 1.5 s")
+    rollout = outcome.trajectory
     known = rollout.time < TIME[-1] - 1.5
-    error = rollout["x"] - led(6)["x"]
-    assert np.abs(error[known]).max() < 0.01 * led(6)["x"].std()
+    error = rollout["x"] - run["x"]
+    assert np.abs(error[known]).max() < 0.01 * run["x"].std()
+    assert simulate(loaded, run, stop=20).guessed == (0, 0)
+    (told,) = validate(loaded, [run]).warnings
+    assert "compared up to 28.5 s" in told
 
 
 def test_what_a_lead_does_not_know_is_left_out_of_a_fit():

@@ -84,6 +84,25 @@ def test_one_that_acts_late_is_named_alone(late):
     assert f"'{other}'" not in note
 
 
+@pytest.mark.parametrize("early", [1.25, 6.0])
+def test_a_disturbance_that_is_recorded_late_is_told_as_early(early):
+    runs = []
+    for k in range(3):
+        run = recorded(k)
+        # What a mast behind the plant, or a clock that is late, makes of c.
+        behind = np.interp(run.time - early, run.time, run["c"])
+        values = np.column_stack([run.select(["x", "a", "b"]).values, behind])
+        runs.append(replace(run, values=values).window(10))
+    (note,) = told(runs)
+    told_by = float(note.split("acts about ")[1].split(" s")[0])
+    assert abs(told_by - early) < 0.3
+    assert f"{{source: c, kind: lead, seconds: {told_by:.3g}}}" in note
+    lead = Feature(source="c", kind="lead", seconds=early)
+    model = fit(runs, replace(SETTINGS, features=(lead,))).model
+    row = dict(zip(model.signals.order.names, model.f.coefficients[0, 0], strict=True))
+    assert float(row["x"]) == pytest.approx(-0.2, abs=0.01)
+
+
 def test_inputs_that_act_at_once_are_not_late():
     fit([recorded(k) for k in range(3)], SETTINGS)  # warnings are errors in these tests
 

@@ -59,6 +59,9 @@ def test_what_stands_still_in_mid_motion_is_named():
     valve = np.repeat(np.random.default_rng(0).normal(size=50), 20)
     fine = run_of(time, a=np.clip(a, -0.5, 0.7), x=x, valve=valve, r=np.round(c, 2))
     assert stuck_notes(fine) == []
+    # A torque that is at its limit in a gust comes and leaves faster than it usually moves.
+    gust = np.minimum(0.02 * np.sin(time) + 3 * np.exp(-(((time - 50) / 6) ** 2)), 1.0)
+    assert stuck_notes(run_of(time, torque=gust)) == []
 
 
 def test_a_fit_names_run_channel_and_time():

@@ -163,6 +163,25 @@ def unknown_ends(features: Iterable[Feature]) -> tuple[float, float]:
     return max(late.values(), default=0.0), max(early.values(), default=0.0)
 
 
+def guessed_ends(
+    run: Trajectory, features: Iterable[Feature], window: tuple[float, float]
+) -> tuple[float, float]:
+    """Seconds at the start and the end of a time window in which features ask for more.
+
+    Parameters
+    ----------
+    run
+        The whole record.
+    features
+        Of the model.
+    window
+        First and last time in s.
+    """
+    late, early = unknown_ends(features)
+    first, last = float(run.time[0]) + late - window[0], window[1] - float(run.time[-1]) + early
+    return max(first, 0.0) if late else 0.0, max(last, 0.0) if early else 0.0
+
+
 def known_window(
     run: Trajectory, features: Iterable[Feature], start: float | None, stop: float | None
 ) -> tuple[float | None, float | None]:

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 _FEWEST, _LONGER = 8, 3
 # A channel that stays for more than this share of its intervals is made so.
 _STAYS = 0.5
-# What is a jump, and what is motion, in usual changes from sample to sample.
-_JUMP, _MOTION = 3.0, 0.3
+# What is a jump, in usual changes from sample to sample and in those of so many samples after it,
+# and what is motion.
+_JUMP, _BESIDE, _MOTION = 3.0, 4, 0.3
 # Share of the channels that vary which must stand still together to be called all of them.
 _ALMOST_ALL = 0.7
 
@@ -112,4 +113,8 @@ def stuck_spans(values: Array) -> list[tuple[int, int]]:
     long = stays >= max(_FEWEST, _LONGER * float(np.median(stays)))
     enters, leaves = np.abs(steps[at[:-1]]), np.abs(steps[at[1:]])
     stuck = long & (enters > _MOTION * usual) & (leaves > _JUMP * usual)
+    for k in np.flatnonzero(stuck):
+        # What leaves a limit goes on as fast as it left.
+        after = steps[at[k + 1] + 1 : at[k + 1] + 1 + _BESIDE]
+        stuck[k] = leaves[k] > _JUMP * np.sqrt(np.mean(after**2)) if len(after) else True
     return [(int(at[k]) + 1, int(at[k + 1])) for k in np.flatnonzero(stuck)]

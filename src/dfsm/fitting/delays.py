@@ -1,9 +1,10 @@
-"""Inputs that act late, by dead time or a lag, which least squares takes for slow dynamics.
+"""Inputs that act late or early, by dead time, a lag or a clock: taken for other dynamics.
 
 Where what inputs did some time ago explains a derivative much better than what they do now, the
 fit has no way to say so but a slower eigenvalue and a larger gain. The same row is fitted with
 inputs delayed by a grid of times, several of them together; the times that leave least say by how
-much they are late.
+much they are late. A disturbance measured behind the plant, or by a clock that is late, acts before
+its record does: the same with times to come.
 
 A row of an order more is no dead time, though it looks like one: with d = dx/dt, the equation
 d' = -d / τ + β x + γ u says that d is β x + γ u behind a lag of τ. The row is therefore fitted
@@ -33,19 +34,19 @@ _FEWEST, _TRIED, _LONGEST = 150, 40, 0.2
 # Of several delays, one that the others do without costs less than so many times what they leave,
 # or than such a share of the residual's variance; and how often all are sought in turn.
 _DOES_WITHOUT, _COSTS, _ROUNDS = 2.0, 0.02, 6
-# A lag has the word before delays that leave so many times as much, and is the whole story only
-# where no more than this is unexplained with it: beyond, several things are missing.
+# A lag has the word before delays that leave so many times as much; it, or an early input, is the
+# whole story only where no more than this is unexplained with it: beyond, several are missing.
 _CLEARER, _WHOLE = 2.0, 0.25
 
 
 @dataclass(frozen=True)
 class LateInputs:
-    """How late inputs act on a row.
+    """How late inputs act on a row, or how early.
 
     Attributes
     ----------
     seconds
-        The delays that explain most, by column of the inputs.
+        The delays that explain most, by column of the inputs; all negative where inputs are early.
     left
         Variance that is left with them.
     unexplained
@@ -78,7 +79,9 @@ class Lag:
     small: bool
 
 
-def late_inputs(residuals: Residuals, columns: Sequence[int]) -> LateInputs | None:
+def late_inputs(
+    residuals: Residuals, columns: Sequence[int], early: bool = False
+) -> LateInputs | None:
     """The inputs whose delays explain most of what a row leaves over, if they explain much.
 
     Parameters
@@ -87,22 +90,28 @@ def late_inputs(residuals: Residuals, columns: Sequence[int]) -> LateInputs | No
         One row.
     columns
         Inputs that may act late.
+    early
+        Look for inputs that act early instead.
     """
     search = _search(residuals)
     moving = [c for c in columns if np.ptp(stacked(residuals.inputs)[:, c]) > 0]
     if search is None or not moving:
         return None
     grid, shortest, share, rows = search
+    ends = shortest, float(grid[-1])
+    grid = np.unique(-grid) if early else grid
     alike = min(grid.tolist(), key=lambda lag: rows.left(dict.fromkeys(moving, float(lag))))
     # From none late, and from all late alike: of two that are, none alone explains much.
     starts = [{}] if len(moving) == 1 else [{}, dict.fromkeys(moving, alike)]
     found = [_in_turn(rows, grid, moving, start) for start in starts]
-    lags = _needed(rows, min(found, key=rows.left), (shortest, float(grid[-1])))
+    lags = _needed(rows, min(found, key=rows.left), ends)
     left = rows.left(lags)
     if not lags or left >= share * rows.left({}):
         return None
     seconds = {c: lag * residuals.step for c, lag in sorted(lags.items())}
-    return LateInputs(seconds, left, *_relative(residuals, left))
+    found = LateInputs(seconds, left, *_relative(residuals, left))
+    # What comes next tells of rates, and of much else that is missing.
+    return None if early and found.unexplained > _WHOLE else found
 
 
 def lag_before(residuals: Residuals, columns: Sequence[int]) -> Lag | None:
@@ -183,7 +192,7 @@ def _in_turn(
 def _needed(rows: _Rows, lags: Mapping[int, float], ends: tuple[float, float]) -> dict[int, float]:
     """The delays that the others cannot do without, the least needed going first."""
     # At the end of the grid it is no delay that is sought, at its head no delay at all.
-    kept = {c: lag for c, lag in lags.items() if ends[0] <= lag < ends[1]}
+    kept = {c: lag for c, lag in lags.items() if ends[0] <= abs(lag) < ends[1]}
     costs = _COSTS * rows.left({})
     while kept:
         left = rows.left(kept)
@@ -273,6 +282,22 @@ def late_note(row: str, names: Sequence[str], late: LateInputs, unexplained: flo
         f"{late.unexplained:.1%} of the row unexplained instead of {unexplained:.1%}, and without "
         f"the delay{'s' * (not one)} the fit takes it for slower dynamics; add the "
         f"feature{'s' * (not one)} {features}"
+    )
+
+
+def early_note(row: str, names: Sequence[str], early: LateInputs, unexplained: float) -> str:
+    """Which disturbances act before they are recorded, by how much, and what to set."""
+    told = [(names[c], f"{-s:.3g}") for c, s in early.seconds.items()]
+    acting = " and ".join(
+        f"'{name}' acts about {s} s before it is recorded" if k == 0 else f"'{name}' about {s} s"
+        for k, (name, s) in enumerate(told)
+    )
+    features = ", ".join(f"{{source: {name}, kind: lead, seconds: {s}}}" for name, s in told)
+    return (
+        f"{row}: {acting}: so advanced {early.unexplained:.1%} of the row is left unexplained "
+        f"instead of {unexplained:.1%}; measured behind the plant, or by a late clock, it wants "
+        f"the feature{'s' * (len(told) > 1)} {features}; where its rate acts, one of kind rate; "
+        "where it follows from the states it is an output"
     )
 
 

@@ -17,7 +17,15 @@ import numpy as np
 from dfsm.core.types import Array
 from dfsm.data.derivatives import StateSpec, kinematic_rows
 from dfsm.fitting.coloured import pulled, pulled_note
-from dfsm.fitting.delays import LateInputs, is_lag, lag_before, lag_note, late_inputs, late_note
+from dfsm.fitting.delays import (
+    LateInputs,
+    early_note,
+    is_lag,
+    lag_before,
+    lag_note,
+    late_inputs,
+    late_note,
+)
 from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
 from dfsm.fitting.noisy_inputs import noise_shares
@@ -143,9 +151,11 @@ def doubts(
             notes.append(text)
             reasons.append(Reason(name, "noise", "an input is noisy", "a smoother record of it"))
         series = residuals_of(samples.times, inputs, target, left[:, place])
-        note = late = None
+        note = late = early = None
         if series is not None:
             late = _late(series, names[:driving], settings)
+            first = len(samples.signals.controls)
+            early = late_inputs(series, range(first, driving), early=True) if not late else None
             states = samples.signals.state_columns
             columns = [*range(driving), *range(states.start, states.stop)]
             lag = None
@@ -186,6 +196,11 @@ def doubts(
             which = " and ".join(f"'{names[c]}'" for c in late.seconds)
             what = f"{which} act{'s' * (len(late.seconds) == 1)} late on it"
             reasons += [Reason(name, "late", what, "the delay told")] * (not late.small)
+        elif early is not None and series is not None:
+            notes.append(early_note(name, names, early, series.unexplained))
+            which = " and ".join(f"'{names[c]}'" for c in early.seconds)
+            what = f"{which} act{'s' * (len(early.seconds) == 1)} before it is recorded"
+            reasons += [Reason(name, "late", what, "what is told of it")] * (not early.small)
         elif series is not None and fit.model.schedule is None:
             free = [c for c in range(len(samples.signals.controls)) if c not in held]
             for twice in pulled(series, free):

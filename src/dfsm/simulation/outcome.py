@@ -96,6 +96,9 @@ class Simulation(DrawnRun):
         Seconds it took (of the whole batch divided by its runs), without compilation when warm.
     note
         What was done otherwise than asked for: shorter steps, or another method; else "".
+    guessed
+        Seconds at its start and its end for which delayed and leading inputs were not recorded:
+        they hold the first and the last value there.
     distance
         From the training data at every sample, ``(time,)``: 1 is as far as is usual.
     strayed
@@ -109,6 +112,7 @@ class Simulation(DrawnRun):
     outside: float
     wall_time: float = 0.0
     note: str = ""
+    guessed: tuple[float, float] = (0.0, 0.0)
     distance: Array = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
     strayed: StrayedPath | None = field(default=None, repr=False, compare=False)
 
@@ -127,7 +131,12 @@ class Simulation(DrawnRun):
     @property
     def message(self) -> str:
         """One sentence on the outcome."""
+        first, last = self.guessed
         more = f"; {self.note}" if self.note else ""
+        if first:
+            more += f"; delayed inputs hold their first value for the first {first:.3g} s"
+        if last:
+            more += f"; leading inputs hold their last value for the last {last:.3g} s"
         if self.status is Status.COMPLETED:
             where = f": {told(self.departures)}" if self.departures else ""
             return f"{self.outside:.1%} of the time outside the training range{where}{more}"

@@ -19,6 +19,7 @@ from dfsm.core.types import Array
 from dfsm.core.workers import in_threads
 from dfsm.data.between import Chosen
 from dfsm.data.derivatives import differentiate
+from dfsm.data.features import guessed_ends
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed, completed
@@ -183,7 +184,9 @@ def simulate(
 
     def judged(i: int, rollout: Rollout) -> Simulation:
         result = judge(model, batch[i], driven[i], rollout)
-        return replace(result, note=steps[i].note)
+        time = driven[i].time
+        guessed = guessed_ends(batch[i], model.signals.features, (time[0], time[-1]))
+        return replace(result, note=steps[i].note, guessed=guessed)
 
     begin = clock.perf_counter()
     steps = _steppings(model, driven, settings)

@@ -102,7 +102,7 @@ def validate(
     for run in runs:
         run.columns(first.signals.recorded)
     notes = [*converted(given, runs), *_leaks(first, runs, intervals)]
-    results, late = list[RunComparison](), list[str]()
+    results, late, early = list[RunComparison](), list[str](), list[str]()
     for run in track(runs, "test runs"):
         known, until = known_window(run, first.signals.features, start, stop)
         results.append(_compare(models, run, (known, until), settings, intervals))
@@ -110,6 +110,11 @@ def validate(
             late.append(
                 f"{run.where}: compared from {known:g} s on, for what acts there with a delay was "
                 "not recorded before"
+            )
+        if until != stop:
+            early.append(
+                f"{run.where}: compared up to {until:g} s, for what acts there ahead of its record "
+                "was not recorded after"
             )
     stepped = [
         f"{name} on {r.recorded.name}: {m.simulation.note}"
@@ -120,8 +125,10 @@ def validate(
     if stepped:
         more = f" (and {len(stepped) - 1} more rollouts alike)" if stepped[1:] else ""
         notes.append(stepped[0] + more)
-    if late:
-        notes.append(late[0] + (f" (and {len(late) - 1} more runs alike)" if late[1:] else ""))
+    for told in (late, early):
+        if told:
+            alike = f" (and {len(told) - 1} more runs alike)" if told[1:] else ""
+            notes.append(told[0] + alike)
     channels = (*first.signals.observed, *first.signals.outputs)
     validation = Validation(
         models=dict(models),
