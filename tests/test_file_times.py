@@ -190,6 +190,14 @@ def test_a_zone_behind_the_name_of_dates_is_no_unit(tmp_path, unit):
     assert any("counts seconds since 1970" in note for note in run.notes)
 
 
+@pytest.mark.parametrize(("unit", "per"), [("s", 1.0), ("ms", 1e3), ("us", 1e6)])
+def test_stamps_with_a_unit_count_from_1970_as_well(tmp_path, unit, per):
+    rows = [f"{round((1.7e9 + t) * per)},{i}" for i, t in enumerate(range(60))]
+    run = read(put(tmp_path / "a.csv", [f"Timestamp [{unit}],x", *rows]))
+    np.testing.assert_array_equal(run.time, np.arange(60.0))
+    assert any(f"counts {unit} since 1970" in note for note in run.notes)
+
+
 # -- dates, stamps, durations -------------------------------------------------------------------
 
 HOURS = [0, 1, 23, 24, 25, 96, 97]

@@ -104,9 +104,15 @@ def seconds_of(name: str, unit: str, time: Array) -> tuple[Array, str]:
         in another unit; else as they are.
     """
     finite = bool(len(time)) and bool(np.isfinite(time).all())
+    dated = is_date_name(name)
+    low, high = _SINCE_1970
     size = 1.0 if unit.lower() in SECONDS else factor(unit, "s")
     if size is None:
         unit = ""  # a time zone, say, behind the name of dates
+    elif unit and finite and (dated or size < 1) and low <= size * time.min() < high:
+        # Doubles of this size tell no more than microseconds.
+        since = np.round(size * (time - time[0]), 6)
+        return since, f"'{name}' counts {unit} since 1970: times are seconds since the first"
     elif size != 1.0:
         for whose, (first, last) in _DAYS.items() if size == _DAY and finite else ():
             if first <= time.min() and time.max() < last:
@@ -114,13 +120,10 @@ def seconds_of(name: str, unit: str, time: Array) -> tuple[Array, str]:
         return size * time, f"'{name}' is in {unit}: times are converted to s"
     if unit or not finite:
         return time, ""
-    dated = is_date_name(name)
-    low, high = _SINCE_1970
     # By themselves seconds are right as they are.
     for word, count in (({"seconds": 1.0} if dated else {}) | _COUNTS).items():
         if low * count <= time.min() and time.max() < high * count:
             note = f"'{name}' counts {word} since 1970: times are seconds since the first"
-            # Doubles of this size tell no more than microseconds.
             return np.round((time - time[0]) / count, 6), note
     for whose, (first, last) in _DAYS.items():
         if first <= time.min() and time.max() < last:
