@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -371,10 +371,19 @@ def _signals(data: Dataset, settings: FitSettings) -> SignalTable:
 
 
 def _between(data: Dataset, settings: FitSettings) -> tuple[Between, ...]:
-    """What inputs do between samples: as chosen, else as it looks in the training data."""
+    """What inputs do between samples: as chosen, else as it looks in the training data.
+
+    A held input that acts late is held: by parts of a sample late, it only looks as if it moved on.
+    """
     names = (*settings.controls, *settings.driving)
+    shifted = {f.name: f.source for f in settings.features if f.seconds is not None}
+    looked = list(dict.fromkeys((*names, *shifted.values())))
     windows = (run.window(settings.start, settings.stop) for run in data)
-    return resolved(settings.inputs, names, recognised(windows, names))
+    found = dict(zip(looked, recognised(windows, looked), strict=True))
+    chosen = settings.inputs if isinstance(settings.inputs, Mapping) else {}
+    for name, source in shifted.items():
+        found[name] = chosen.get(source, found[source])
+    return resolved(settings.inputs, names, [found[name] for name in names])
 
 
 def _azimuth(run: Trajectory, azimuth: Azimuth | None) -> Array:
