@@ -38,6 +38,7 @@ from turbine_runs import (
 RINGS = ("U_r015", "U_r036", "U_r057", "U_r078", "U_r099", "U_r116", "U_cubic")
 # The elevation so many seconds ahead: waves of 7 s need four to go from one column to the next.
 AHEAD = tuple(dfsm.Feature(source="Wave1Elev", kind="lead", seconds=s) for s in (2.0, 4.0, 6.0))
+OVERHANG = 12.03  # m
 # What moves the platform besides the rotor, by the equation of motion in pitch.
 HYDRODYNAMICS = (
     *("PtfmPitch", "PtfmPitch_dot", "Wave1Elev", "Wave1Elev_dot"),
@@ -55,6 +56,9 @@ def rotor(rings: Sequence[str] = RINGS) -> dfsm.Rotor:
         pitch="BldPitch1",
         hub_height=HUB_HEIGHT,
         pitch_rate="PtfmPitch_dot",
+        overhang=OVERHANG,
+        wind_rate="RotWind_dot",
+        platform_pitch="PtfmPitch",
         corrections=tuple(f"{ring}-RotWind" for ring in rings),
         inertia=318.6e6,  # with the generator
         generator_torque="GenTq",
@@ -80,7 +84,12 @@ def settings(
         ),
         controls=CONTROLS,
         disturbances=DISTURBANCES,
-        features=(dfsm.Feature(source="Wave1Elev"), *ahead, *excess),
+        features=(
+            dfsm.Feature(source="RotWind"),
+            dfsm.Feature(source="Wave1Elev"),
+            *ahead,
+            *excess,
+        ),
         outputs=OUTPUTS,
         terms=(rotor(rings),),
         linear=dfsm.LPV(

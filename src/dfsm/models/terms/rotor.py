@@ -48,6 +48,13 @@ class Rotor:
         wind.
     surge_rate
         Channel of the platform's velocity downwind in m/s, which is taken off the wind.
+    overhang, wind_rate
+        How far upwind of the tower's place at rest, where `wind` is told, the middle of the blades
+        stands, in m, and the channel of the wind's rate in m/s² (a feature of kind rate): the rotor
+        meets the wind by so much earlier, see `terms.rotor_place`.
+    platform_pitch, surge
+        With these, channels of what carries it downwind: the platform's pitch in deg or rad (times
+        hub_height), positive downwind, and its surge in m.
     gearbox_ratio
         Of `speed` to the speed of the rotor.
     corrections
@@ -86,6 +93,10 @@ class Rotor:
     hub_height: float | None = None
     pitch_rate: str | None = None
     surge_rate: str | None = None
+    overhang: float | None = None
+    wind_rate: str | None = None
+    platform_pitch: str | None = None
+    surge: str | None = None
     gearbox_ratio: float = 1.0
     corrections: tuple[str, ...] = ()
     inertia: float | None = None
@@ -122,6 +133,7 @@ class Rotor:
                 f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: the platform's "
                 "motion at the hub is their product, set both or neither"
             )
+        self._check_place()
         if (self.inertia is None) != (self.generator_torque is None):
             here, lacking = "inertia", "generator_torque"
             if self.inertia is None:
@@ -134,10 +146,35 @@ class Rotor:
         if twice:
             raise DfsmError(f"rotor: channel '{twice[0]}' is named twice: name it once")
 
+    def _check_place(self) -> None:
+        """Where the rotor stands takes a distance and a rate, and says what carries it."""
+        finite = self.overhang is None or bool(np.isfinite(self.overhang))
+        require(finite, "rotor.overhang", self.overhang, "a number of m, 0 for none")
+        if (self.overhang is None) != (self.wind_rate is None):
+            here, lacking = "overhang", "wind_rate"
+            if self.overhang is None:
+                here, lacking = lacking, here
+            raise DfsmError(
+                f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: what a rotor "
+                "meets that stands elsewhere follows from both, set both or neither"
+            )
+        carried = [key for key in ("platform_pitch", "surge") if getattr(self, key) is not None]
+        if carried and self.overhang is None:
+            raise DfsmError(
+                f"rotor.{carried[0]} is '{getattr(self, carried[0])}' without rotor.overhang and "
+                "rotor.wind_rate: it moves the place at which the wind is met, set them as well"
+            )
+        if self.platform_pitch is not None and self.hub_height is None:
+            raise DfsmError(
+                f"rotor.platform_pitch is '{self.platform_pitch}' without rotor.hub_height: how "
+                "far a platform that leans carries the hub follows from both"
+            )
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Channels that it takes."""
-        motion = (n for n in (self.pitch_rate, self.surge_rate) if n is not None)
+        place = (self.wind_rate, self.platform_pitch, self.surge)
+        motion = (n for n in (self.pitch_rate, self.surge_rate, *place) if n is not None)
         return (self.wind, self.speed, self.pitch, *motion, *self.corrections)
 
     def term(
@@ -164,17 +201,22 @@ class Rotor:
         """
         what = f"rotor '{self.name}'"
         _, at = input_columns(what, self.inputs, channels, columns)
-        for key in ("wind", "surge_rate", "corrections"):
+        units = dict.fromkeys(("wind", "surge_rate", "corrections"), "m/s")
+        for key, unit in (units | {"wind_rate": "m/s^2", "surge": "m"}).items():
             named = getattr(self, key)
             for name in named if isinstance(named, tuple) else (named,):
                 if name is not None:
-                    _same(what, key, channels[name], "m/s")
+                    _same(what, key, channels[name], unit)
         speed = _factor(what, "speed", channels[self.speed], _SPEEDS) / self.gearbox_ratio
         pitch = _factor(what, "pitch", channels[self.pitch], ("rad", "deg"))
         arm = None
         if self.pitch_rate is not None and self.hub_height is not None:
             rate = _factor(what, "pitch_rate", channels[self.pitch_rate], _SPEEDS[1:])
             arm = self.hub_height * rate
+        lean = None
+        if self.platform_pitch is not None and self.hub_height is not None:
+            angle = _factor(what, "platform_pitch", channels[self.platform_pitch], ("rad", "deg"))
+            lean = self.hub_height * angle
         if self.generator_torque is not None:
             braking = input_columns(what, (self.generator_torque,), channels, columns)[0]
             _same(what, "generator_torque", braking[0], "kNm")
@@ -190,6 +232,9 @@ class Rotor:
             pitch_factor=float(np.rad2deg(pitch)),
             arm=arm,
             surges=self.surge_rate is not None,
+            overhang=self.overhang,
+            lean=lean,
+            drifts=self.surge is not None,
             gearbox_ratio=self.gearbox_ratio,
             inertia=self.inertia,
             efficiency=self.efficiency,

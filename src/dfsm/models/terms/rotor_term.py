@@ -23,6 +23,7 @@ from dfsm.models.terms.induction import (
     wind_of_inflow,
 )
 from dfsm.models.terms.rotor_check import check_signals
+from dfsm.models.terms.rotor_place import lead_time
 from dfsm.models.terms.rotor_surface import TOLERANCE, Grid, surface_values
 from dfsm.numerics.hats import hats
 
@@ -50,6 +51,10 @@ class RotorConstants:
         What one unit of the pitch rate takes off the wind, in m/s; None without that signal.
     surges
         Whether there is a surge rate.
+    overhang, lean, drifts
+        How far upwind the rotor stands in m, None where it is taken to stand where the wind is
+        told; what one unit of platform pitch carries it downwind in m, None without that signal;
+        and whether there is a surge.
     ratios, angles
         First and last tip speed ratio and pitch in deg of the table.
     optimum
@@ -82,12 +87,22 @@ class RotorConstants:
     pitch_unit: str
     error: float
     lags: int = 0
+    overhang: float | None = None
+    lean: float | None = None
+    drifts: bool = False
+
+    @property
+    def motions(self) -> int:
+        """How many signals tell how the rotor moves and where it stands."""
+        here = [self.arm is not None, self.surges]
+        return sum([*here, self.overhang is not None, self.lean is not None, self.drifts])
 
 
 class RotorTerm(Term):
     """Thrust in kN and torque in kN m; C² in all signals, and finite everywhere.
 
-    ``v = wind + Σ a_k d_k - hub_height pitch_rate - surge_rate`` is the wind at the rotor and
+    ``v = wind + τ wind_rate + Σ a_k d_k - hub_height pitch_rate - surge_rate`` is the wind at the
+    rotor, which stands where it meets the wind told for τ later (see `rotor_place`), and
     ``λ = ω R / v`` its tip speed ratio; thrust is ``½ ρ π R² v² Ct(λ, β)``, torque
     ``½ ρ π R³ v² Cq(λ, β)``. See `rotor_surface` for how the table is continued beyond its ends.
 
@@ -185,8 +200,7 @@ class RotorTerm(Term):
     @property
     def _induced(self) -> int:
         """Where the first state of the induced velocity stands among the signals."""
-        motions = (self.about.arm is not None) + self.about.surges
-        return 3 + motions + self.gains.shape[0]
+        return 3 + self.about.motions + self.gains.shape[0]
 
     def inflow(self, signals: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Wind at the rotor and speed of its tips in m/s, pitch in deg, each ``(...)``.
@@ -203,6 +217,16 @@ class RotorTerm(Term):
         if about.surges:
             wind = wind - signals[..., at]
             at += 1
+        if about.overhang is not None:
+            rate, distance = signals[..., at], jnp.asarray(about.overhang)
+            at += 1
+            if about.lean is not None:
+                distance = distance - about.lean * signals[..., at]
+                at += 1
+            if about.drifts:
+                distance = distance - signals[..., at]
+                at += 1
+            wind = wind + lead_time(distance, signals[..., 0]) * rate
         if corrections := self.gains.shape[0]:
             wind = wind + signals[..., at : at + corrections] @ self.gains
             at += corrections
@@ -381,7 +405,9 @@ class RotorTerm(Term):
         structure: Mapping[str, Any],
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
-        told = {"memory": "speed", "uncertainty": 0.0, "lags": 0, **structure["about"]}
+        # What models had none of that were made before there was any.
+        place = {"overhang": None, "lean": None, "drifts": False}
+        told = {"memory": "speed", "uncertainty": 0.0, "lags": 0, **place, **structure["about"]}
         # JSON turns tuples into lists, which are no keys of compiled functions.
         about: dict[str, Any] = {
             f.name: tuple(told[f.name]) if isinstance(told[f.name], list) else told[f.name]
