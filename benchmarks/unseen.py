@@ -40,19 +40,21 @@ def run() -> dict[str, Any]:
     tests = {label: turbine.with_rings(runs) for label, runs in tests.items()}
     plain = uncorrected()
     bare = {"corrective": dfsm.NoCorrection(), "corrected": None, "outputs": ()}
-    still = replace(rotor.settings(ahead=()), **bare)
+    nowhere = {"overhang": None, "wind_rate": None, "platform_pitch": None}
 
     def with_rotor(settings: dfsm.FitSettings, **changes: Any) -> dfsm.FitSettings:
         terms = (replace(term, **changes) for term in settings.terms)
         return replace(settings, **bare, terms=tuple(terms))
 
-    steady = {"induction": "steady", "uncertainty": 0.0}
+    still = with_rotor(rotor.settings(ahead=()), **nowhere)
+    ahead = with_rotor(rotor.settings(), **nowhere)
+    steady = {**nowhere, "induction": "steady", "uncertainty": 0.0}
     table = with_rotor(rotor.settings((), ()), memory="speed", **steady)
     rings = with_rotor(still, memory="speed", **steady)
     through_wind = with_rotor(still, **steady)
     factors = with_rotor(still, induction="steady")
-    ahead = {feature.name for feature in rotor.AHEAD}
-    inputs = tuple(n for n in rotor.REFINEMENT.latent_inputs or () if n not in ahead)
+    coming = {feature.name for feature in rotor.AHEAD}
+    inputs = tuple(n for n in rotor.REFINEMENT.latent_inputs or () if n not in coming)
     by_wind = replace(rotor.REFINEMENT, latent_inputs=inputs)
     by_pitch = replace(scheduled.REFINEMENT, network=0)
     results = {}
@@ -64,7 +66,8 @@ def run() -> dict[str, Any]:
         ("and smooth factors of the table", factors, by_pitch),
         ("and latent states of wind and waves alone", factors, by_wind),
         ("and induced velocities that lag", still, by_wind),
-        ("and the waves some seconds ahead", replace(rotor.settings(), **bare), rotor.REFINEMENT),
+        ("and the waves some seconds ahead", ahead, rotor.REFINEMENT),
+        ("and the wind where the rotor stands", with_rotor(rotor.settings()), rotor.REFINEMENT),
     ):
         begin = time.perf_counter()
         with warnings.catch_warnings():
