@@ -89,6 +89,7 @@ class Actuator(Wrapper):
     ) -> tuple[ActuatorState, jax.Array]:
         """Next state, and commands; see `Controller.step`."""
         inner, commands = self.inner.step(state.inner, measurements, time)
+        commands = jnp.asarray(commands, dtype=float)
         wanted = commands[self._columns]
         position, velocity = wanted, state.velocity
         if self.corner is not None:

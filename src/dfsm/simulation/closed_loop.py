@@ -40,6 +40,7 @@ from dfsm.simulation.loop_cases import (
     prepared_cases,
 )
 from dfsm.simulation.outcome import ESCAPE
+from dfsm.simulation.own_loop import own_to_a_loop
 from dfsm.simulation.wires import Wires, connect, not_commanded
 
 # What is kept of a closed loop.
@@ -149,7 +150,8 @@ def closed_loop(
         that the controller does not set.
     controller
         Steps at its interval and holds its commands in between. An equinox module is compiled with
-        the plant; any other `Controller`, a `BladedLibrary` say, is called on the host.
+        the plant; any other `Controller`, a `BladedLibrary` say, is called on the host. One that
+        can change is copied for every loop, so that nothing of one run enters another.
     start, stop
         Time window in s that is scored; None leaves that end open.
     measurements
@@ -313,7 +315,11 @@ def _roller(
         def gone(x: Array) -> bool:
             return not bool(((x >= low) & (x <= high)).all())
 
-        return lambda case, _: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
+        def stepped(case: LoopCase, _: Callable[[], Drive]) -> Path:
+            with own_to_a_loop(controller) as law:
+                return host.roll(law, padded(case, len(case.drive.time) + 1), gone)
+
+        return stepped
     numbers = as_arrays(controller)
 
     def compiled(_: LoopCase, padded_drive: Callable[[], Drive]) -> Path:
