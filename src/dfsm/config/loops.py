@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-import numpy as np
 from pydantic import Field
 
 from dfsm.config.parse import Strict
+from dfsm.core.settings import require_number
+from dfsm.core.units import factor, known
 from dfsm.data.trajectory import Trajectory
+from dfsm.errors import DfsmError
 from dfsm.loops.load_cases import weibull_weights
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 
 
@@ -21,17 +25,41 @@ class Weibull(Strict):
     mean, shape
         Of the Weibull distribution, in m/s.
     wind
-        Channel of the wind; its mean, rounded to whole m/s, is a run's.
+        Channel of the wind; its mean, rounded to multiples of `step`, is a run's.
+    step
+        In m/s; runs of one rounded mean are seeds of one wind.
     """
 
     mean: float
     shape: float = 2.0
     wind: str = "RotWind"
+    step: float = 1.0
+
+    def winds(self, runs: Sequence[Trajectory]) -> list[float]:
+        """Mean wind of every run in m/s.
+
+        Raises
+        ------
+        DfsmError
+            A run without the channel, or one that is no speed; or a step that is not above 0.
+        """
+        require_number("step of the winds", self.step, "m/s, more than 0", above=0)
+        return [self.step * math.floor(self._mean(run) / self.step + 0.5) for run in runs]
+
+    def _mean(self, run: Trajectory) -> float:
+        mean = float(mean_over(run[self.wind], weights_over_time([run.time])))
+        unit = run.channel(self.wind).unit
+        scale = factor(unit, "m/s") if known(unit) else 1.0
+        if scale is None:
+            raise DfsmError(
+                f"{run.where}: weights follow '{self.wind}', which is in '{unit}', expected a "
+                "speed: name another channel as their wind"
+            )
+        return scale * mean
 
     def weights(self, runs: Sequence[Trajectory]) -> list[float]:
         """Share of every run."""
-        winds = [float(np.round(run[self.wind].mean())) for run in runs]
-        return weibull_weights(winds, self.mean, self.shape)
+        return weibull_weights(self.winds(runs), self.mean, self.shape)
 
 
 class LoopsConfig(Strict):

@@ -114,16 +114,19 @@ def explain(
     error: ValidationError, raw: dict[str, Any], kind: type[BaseModel], prefix: str = ""
 ) -> str:
     """The first thing wrong, with the path of its key as it stands in the file."""
-    first = error.errors()[0]
+    first = _telling(error.errors(), raw)
     if first["type"] == "value_error":
         # Raised by a settings class itself, already one sentence.
         return str(first.get("ctx", {}).get("error", first["msg"]))
-    keys = _path(first["loc"], raw)
+    lost = first["type"] in _MISSING
+    keys = _path(first["loc"], raw) if lost else _place(first, raw)
     where = prefix + _written(keys)
+    if first["type"] in _MESSAGES:
+        return f"'{where}': {_either(error.errors(), first, raw)}"
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _known_keys(keys[:-1], raw, kind)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
-    if first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument"):
+    if lost:
         return f"key '{where}' is missing"
     if first["type"].startswith("union_tag"):
         kinds = ", ".join(f"'{k}'" for k in _kinds(keys, kind))
@@ -132,15 +135,51 @@ def explain(
             return f"'{where}' needs a key 'kind', one of {kinds}"
         hint = near_matches(str(named), _kinds(keys, kind))
         return f"'{where}.kind' is '{named}', expected one of {kinds}; {hint}"
-    value = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
-    if isinstance(first["input"], str) and _COMMA.fullmatch(first["input"].strip()):
-        value += ", which has a decimal comma: write a point"
-    message = _MESSAGES.get(first["type"], first["msg"])
-    return f"'{where}': {message[0].lower()}{message[1:]}{value}"
+    message = first["msg"]
+    return f"'{where}': {message[0].lower()}{message[1:]}{_not_that(first['input'])}"
+
+
+def _not_that(given: Any) -> str:
+    if isinstance(given, dict | list):
+        return ""
+    comma = isinstance(given, str) and _COMMA.fullmatch(given.strip())
+    return f", not {given!r}" + (", which has a decimal comma: write a point" if comma else "")
+
+
+def _telling(errors: Sequence[Any], raw: Any) -> Any:
+    """The first error; where a list or keys may stand, that of what does stand there."""
+    first = errors[0]
+    if first["type"] not in _MESSAGES:
+        return first
+    place = _place(first, raw)
+    within = [e for e in errors if _path(e["loc"], raw)[: len(place)] == place]
+    return next((e for e in within if e["type"] not in _MESSAGES), first)
+
+
+def _either(errors: Sequence[Any], first: Any, raw: Any) -> str:
+    """What was expected where something of another kind stands, and what does."""
+    place = _place(first, raw)
+    there = [e for e in errors if e["type"] in _MESSAGES and _place(e, raw) == place]
+    expected = {_MESSAGES[e["type"]] for e in there}
+    told = _MESSAGES[first["type"]] if len(expected) == 1 else _BOTH
+    return f"{told}{_not_that(first['input'])}"
+
+
+def _place(error: Any, raw: Any) -> list[int | str]:
+    """Path of the key that is wrong, which is there, without names of pydantic's own."""
+    node, keys = raw, list[int | str]()
+    for key in error["loc"]:
+        try:
+            node = node[key]
+        except (KeyError, IndexError, TypeError):
+            continue
+        keys.append(key)
+    return keys
 
 
 # Where pydantic speaks of Python, in the words of a configuration file.
 _KEYS, _LIST = "keys and values were expected, as {key: value}", "a list was expected, as [a, b]"
+_BOTH = "a list was expected, as [a, b], or keys and values, as {key: value}"
 _MESSAGES: dict[str, str] = {
     "model_type": _KEYS,
     "model_attributes_type": _KEYS,
@@ -149,6 +188,9 @@ _MESSAGES: dict[str, str] = {
     "list_type": _LIST,
     "tuple_type": _LIST,
 }
+
+
+_MISSING = ("missing", "missing_argument", "missing_keyword_only_argument")
 
 
 def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:

@@ -11,6 +11,7 @@ from dfsm.core.settings import require, require_kind, require_number, settings_c
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.fatigue_slope import damage_with_slope
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 
 Kind = Literal["mean", "std", "maximum", "minimum", "overshoot", "travel", "rate", "damage"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -93,13 +94,9 @@ class Measure:
             The figure, and its derivative with respect to the values, shape ``(time,)``; that of an
             extreme belongs to the sample where it is.
         """
-        n, duration = len(values), float(time[-1] - time[0])
-        slope = np.zeros(n)
-        if self.measure == "mean":
-            return float(values.mean()), slope + 1 / n
-        if self.measure == "std":
-            size = float(values.std())
-            return size, (values - values.mean()) / (n * size) if size else slope
+        duration, slope = float(time[-1] - time[0]), np.zeros(len(values))
+        if self.measure in ("mean", "std"):
+            return self._over_time(time, values)
         if self.measure == "damage":
             return damage_with_slope(values, duration, self.exponent)
         if self.measure in ("travel", "rate"):
@@ -109,6 +106,15 @@ class Measure:
         if self.reference is not None:
             return float(values[at]) / self.reference - 1, slope / self.reference
         return float(values[at]), slope
+
+    def _over_time(self, time: Array, values: Array) -> tuple[float, Array]:
+        weights = weights_over_time([time])
+        shares = np.ones(len(values)) if weights is None else weights
+        shares, mean = shares / shares.sum(), float(mean_over(values, weights))
+        if self.measure == "mean":
+            return mean, shares
+        size = float(std_over(values, weights))
+        return size, shares * (values - mean) / size if size else 0 * shares
 
     def _of_rates(self, time: Array, values: Array) -> tuple[float, Array]:
         steps, lasting = np.diff(values), np.diff(time)

@@ -29,6 +29,7 @@ from dfsm.errors import DfsmWarning, printable
 from dfsm.models.departures import MUCH_OUTSIDE, Departure, departures, told
 from dfsm.models.dfsm import DFSM
 from dfsm.models.staged import staged
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_compiled
 from dfsm.simulation.loop_cases import (
@@ -74,7 +75,7 @@ class ClosedLoopRun(DrawnRun):
     reason
         For a loop that did not complete, the signal and where; else "".
     outside
-        Share of the samples with any input of the model outside its training range; not a number
+        Share of the time with any input of the model outside its training range; not a number
         where nobody asked.
     departures
         Where it left the training range, those that lasted longest first.
@@ -420,7 +421,8 @@ def _cut(
     part = Trajectory(
         run.time[kept], values[kept], tuple(channels), name=run.name, source=run.source
     )
-    return ClosedLoopRun(part, status, float(ended), reason, float(outside[kept].mean()))
+    share = float(mean_over(outside[kept], weights_over_time([part.time])))
+    return ClosedLoopRun(part, status, float(ended), reason, share)
 
 
 def _warn(results: Sequence[ClosedLoopRun]) -> None:
