@@ -98,6 +98,27 @@ def test_every_measure_has_the_slope_that_differences_have(asked):
         assert judged.slope[i] == pytest.approx((costs[0] - costs[1]) / (2 * e), rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("interval", "sampling"), [(0.1, 0.1), (0.4, 0.1), (0.4, 0.05), (0.1, 0.4)]
+)
+def test_the_rate_of_a_command_is_from_one_to_the_next(interval, sampling):
+    model, law = task().model, replace(LAW, interval=interval)
+    time = np.arange(0, 20.001, sampling)
+    inputs = np.stack([0 * time, np.sin(1.7 * time)], axis=1)
+    run = driving_run(model, time, inputs, np.tile([0.5, 0], (len(time), 1)), "r")
+    rate = Goal(measure="rate", channel="u0")
+    problem = package.TuningProblem(parameters={"kp": (-3.0, 3.0)}, objective=(rate,))
+    own = TuningTask(model, [run], law, problem, None, None, SETTINGS)
+    at = own.tuned.start
+    found = own.evaluator(at, slopes=True)
+    u, every = own.evaluator.loops(at)[0].trajectory["u0"], max(1, round(interval / sampling))
+    expected = np.abs(np.diff(u[::every])).max() / max(interval, sampling)
+    assert found.figures.item() == pytest.approx(expected, rel=1e-6)
+    ends = [own.evaluator(at + s).figures.item() for s in (1e-6, -1e-6)]
+    assert found.slopes is not None
+    assert found.slopes.item() == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
+
+
 def test_the_optimum_is_that_of_a_grid_and_limits_hold(tmp_path):
     problem = replace(
         ASKED,

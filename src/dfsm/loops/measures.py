@@ -80,13 +80,16 @@ class Measure:
             return ""
         return f"{of_channel}/s" if self.measure in ("travel", "rate") else of_channel
 
-    def along(self, time: Array, values: Array) -> tuple[float, Array]:
+    def along(self, time: Array, values: Array, held: float = 0.0) -> tuple[float, Array]:
         """Figure of one run, and its slope with every sample.
 
         Parameters
         ----------
         time, values
             Shapes ``(time,)``.
+        held
+            Seconds for which a command is held: a rate is that from one command to the next, however
+            short the samples are in between.
 
         Returns
         -------
@@ -100,7 +103,7 @@ class Measure:
         if self.measure == "damage":
             return damage_with_slope(values, duration, self.exponent)
         if self.measure in ("travel", "rate"):
-            return self._of_rates(time, values)
+            return self._of_rates(time, values, held)
         at = int(np.argmin(values) if self.measure == "minimum" else np.argmax(values))
         slope[at] = 1.0
         if self.reference is not None:
@@ -116,18 +119,22 @@ class Measure:
         size = float(std_over(values, weights))
         return size, shares * (values - mean) / size if size else 0 * shares
 
-    def _of_rates(self, time: Array, values: Array) -> tuple[float, Array]:
-        steps, lasting = np.diff(values), np.diff(time)
-        ways, slope = np.sign(steps), np.zeros(len(values))
+    def _of_rates(self, time: Array, values: Array, held: float) -> tuple[float, Array]:
+        slope = np.zeros(len(values))
         if self.measure == "travel":
-            duration = float(time[-1] - time[0])
-            slope[1:] += ways / duration
-            slope[:-1] -= ways / duration
+            steps, duration = np.diff(values), float(time[-1] - time[0])
+            ways = np.sign(steps) / duration
+            slope[1:] += ways
+            slope[:-1] -= ways
             return float(np.abs(steps).sum() / duration), slope
-        rates = np.abs(steps) / lasting
-        at = int(np.argmax(rates))
-        slope[at + 1], slope[at] = ways[at] / lasting[at], -ways[at] / lasting[at]
-        return float(rates[at]), slope
+        first = np.arange(len(time) - 1)
+        after = np.searchsorted(time, time[:-1] + held * (1 - 1e-6))
+        after = np.minimum(np.maximum(after, first + 1), len(time) - 1)
+        rates = (values[after] - values[first]) / np.maximum(time[after] - time[first], held)
+        at = int(np.argmax(np.abs(rates)))
+        per_value = np.sign(rates[at]) / max(time[after[at]] - time[at], held)
+        slope[after[at]], slope[at] = per_value, -per_value
+        return float(abs(rates[at])), slope
 
     def over(self, figures: Sequence[float], weights: Sequence[float]) -> tuple[float, Array]:
         """Figure of several runs, and its slope with theirs.

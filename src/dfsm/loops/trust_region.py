@@ -342,7 +342,8 @@ def _measured(task: TuningTask, k: int, run: Any) -> list[float]:
         )
     known = {c.name: c for c in (*s.observed, *s.controls, *s.outputs)}
     part = in_units_of(run.select(names), [known[n] for n in names]).window(begins, ends)
-    return [m.along(part.time, part[m.channel])[0] for m in task.problem.measures]
+    held = task.evaluator.held
+    return [m.along(part.time, part[m.channel], held(m.channel))[0] for m in task.problem.measures]
 
 
 def _flight(

@@ -194,6 +194,11 @@ class Evaluator:
         # Where a function stood in memory says nothing of it.
         return re.sub(r"0x[0-9a-f]+", "", str(recorded)), *_constants(recorded)
 
+    def held(self, channel: str) -> float:
+        """Seconds for which the controller holds a command; 0 for what it does not set."""
+        commanded = channel in self.tuned.controller.commands
+        return float(self.tuned.controller.interval) if commanded else 0.0
+
     def loops(self, theta: Array) -> list[ClosedLoopRun]:
         """The closed loops themselves at a point."""
         controller = self.tuned.at(theta)
@@ -241,7 +246,8 @@ class Evaluator:
             steps = np.asarray(moved)[:, : case.rows]
             ways = [case.sampled(way)[case.scored :] for way in steps]
         for m, measure in enumerate(self.measures):
-            figure, along = measure.along(run.time, run[measure.channel])
+            held = self.held(measure.channel)
+            figure, along = measure.along(run.time, run[measure.channel], held)
             figures.append(figure)
             if ways is not None:
                 column = shown.index(measure.channel)
