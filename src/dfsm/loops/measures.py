@@ -88,8 +88,8 @@ class Measure:
         time, values
             Shapes ``(time,)``.
         held
-            Seconds for which a command is held: a rate is that from one command to the next, however
-            short the samples are in between.
+            Seconds for which a command is held: a rate is that from one command to the next,
+            however short the samples are in between.
 
         Returns
         -------
