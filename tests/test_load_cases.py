@@ -140,14 +140,24 @@ def test_the_file_of_a_sweep_tells_conditions_and_what_is_wrong_with_weights(her
     pooled = json.loads(dfsm("sweep", "sweep.yaml", "-o", "out", "--json").out)
     write_config(Path("sweep.yaml"), config)
     apart = json.loads(dfsm("sweep", "sweep.yaml", "-o", "out", "--json").out)
+    # By name, in any order.
+    names = [run["name"] for run in apart["runs"]]
+    shares = {name: 0.1 * (k + 1) for k, name in enumerate(names)}
+    told = config | {"weights": dict(reversed(shares.items()))}
+    write_config(Path("sweep.yaml"), told)
+    named = json.loads(dfsm("sweep", "sweep.yaml", "-o", "out", "--json").out)
+    assert {run["name"]: run["weight"] for run in named["runs"]} == shares
     one, other = (s["controllers"][0]["extremes"]["y"] for s in (pooled, apart))
     assert one["blocks"] == other["blocks"]
     assert one["value"] != other["value"] or count == 1
     for weights, sentence in (
         ({"mean": "9 m/s"}, "'weights.mean': input should be a valid number"),
         ({"shape": 2}, "key 'weights.mean' is missing"),
+        ({"Mean": 9}, "weights: there is no run 'Mean'; known are: "),
+        ({"d": 1, "dd": 2}, "weights: there is no run 'dd'; did you mean 'd'?"),
+        ({}, "has none: add one, or leave the run out"),
         ({"mean": 9, "wnd": "q"}, "unknown key 'weights.wnd'; did you mean 'wind'?"),
-        ("rayleigh", "'weights': a list was expected, as [a, b], or keys and values"),
+        ("rayleigh", "'weights': a list was expected, as [a, b], not 'rayleigh'"),
     ):
         write_config(Path("bad.yaml"), config | {"weights": weights})
         assert sentence in dfsm("sweep", "bad.yaml", "-o", "out").sentence

@@ -114,15 +114,13 @@ def explain(
     error: ValidationError, raw: dict[str, Any], kind: type[BaseModel], prefix: str = ""
 ) -> str:
     """The first thing wrong, with the path of its key as it stands in the file."""
-    first = _telling(error.errors(), raw)
+    first = error.errors()[0]
     if first["type"] == "value_error":
         # Raised by a settings class itself, already one sentence.
         return str(first.get("ctx", {}).get("error", first["msg"]))
-    lost = first["type"] in _MISSING
-    keys = _path(first["loc"], raw) if lost else _place(first, raw)
+    lost = first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument")
+    keys = _path(first["loc"], raw) if lost else _place(first["loc"], raw)
     where = prefix + _written(keys)
-    if first["type"] in _MESSAGES:
-        return f"'{where}': {_either(error.errors(), first, raw)}"
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _known_keys(keys[:-1], raw, kind)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
@@ -135,40 +133,17 @@ def explain(
             return f"'{where}' needs a key 'kind', one of {kinds}"
         hint = near_matches(str(named), _kinds(keys, kind))
         return f"'{where}.kind' is '{named}', expected one of {kinds}; {hint}"
-    message = first["msg"]
-    return f"'{where}': {message[0].lower()}{message[1:]}{_not_that(first['input'])}"
+    value = f", not {first['input']!r}" if not isinstance(first["input"], dict | list) else ""
+    if isinstance(first["input"], str) and _COMMA.fullmatch(first["input"].strip()):
+        value += ", which has a decimal comma: write a point"
+    message = _MESSAGES.get(first["type"], first["msg"])
+    return f"'{where}': {message[0].lower()}{message[1:]}{value}"
 
 
-def _not_that(given: Any) -> str:
-    if isinstance(given, dict | list):
-        return ""
-    comma = isinstance(given, str) and _COMMA.fullmatch(given.strip())
-    return f", not {given!r}" + (", which has a decimal comma: write a point" if comma else "")
-
-
-def _telling(errors: Sequence[Any], raw: Any) -> Any:
-    """The first error; where a list or keys may stand, that of what does stand there."""
-    first = errors[0]
-    if first["type"] not in _MESSAGES:
-        return first
-    place = _place(first, raw)
-    within = [e for e in errors if _path(e["loc"], raw)[: len(place)] == place]
-    return next((e for e in within if e["type"] not in _MESSAGES), first)
-
-
-def _either(errors: Sequence[Any], first: Any, raw: Any) -> str:
-    """What was expected where something of another kind stands, and what does."""
-    place = _place(first, raw)
-    there = [e for e in errors if e["type"] in _MESSAGES and _place(e, raw) == place]
-    expected = {_MESSAGES[e["type"]] for e in there}
-    told = _MESSAGES[first["type"]] if len(expected) == 1 else _BOTH
-    return f"{told}{_not_that(first['input'])}"
-
-
-def _place(error: Any, raw: Any) -> list[int | str]:
-    """Path of the key that is wrong, which is there, without names of pydantic's own."""
+def _place(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
+    """Path of a key that is there, without names of union members, its last one included."""
     node, keys = raw, list[int | str]()
-    for key in error["loc"]:
+    for key in loc:
         try:
             node = node[key]
         except (KeyError, IndexError, TypeError):
@@ -179,7 +154,6 @@ def _place(error: Any, raw: Any) -> list[int | str]:
 
 # Where pydantic speaks of Python, in the words of a configuration file.
 _KEYS, _LIST = "keys and values were expected, as {key: value}", "a list was expected, as [a, b]"
-_BOTH = "a list was expected, as [a, b], or keys and values, as {key: value}"
 _MESSAGES: dict[str, str] = {
     "model_type": _KEYS,
     "model_attributes_type": _KEYS,
@@ -188,9 +162,6 @@ _MESSAGES: dict[str, str] = {
     "list_type": _LIST,
     "tuple_type": _LIST,
 }
-
-
-_MISSING = ("missing", "missing_argument", "missing_keyword_only_argument")
 
 
 def _path(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
@@ -244,11 +215,15 @@ def _children(schema: dict[str, Any], node: dict[str, Any], key: int | str) -> l
         child = node.get("additionalProperties")
     if not isinstance(child, dict):
         return []
-    options = child.get("oneOf") or child.get("anyOf") or [child]
-    resolved = [_resolve(schema, o) for o in options]
-    return [r for r in resolved if isinstance(r, dict)]
+    return list(_options(schema, child))
 
 
-def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+def _options(schema: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """What a node may be, where it may be one of several things, of which each may be."""
     reference = node.get("$ref")
-    return schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node
+    node = schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node
+    several = node.get("oneOf") or node.get("anyOf")
+    if several is None:
+        yield node
+    for option in several or ():
+        yield from _options(schema, option)
