@@ -133,6 +133,8 @@ class ConfirmedTuning:
             true = "ended early" if flight.true is None else f"{flight.true:.5g}"
             if flight.predicted is not None:
                 true += f", predicted {flight.predicted:.5g}"
+            if flight.violation is not None and flight.violation > FEASIBLE:
+                true += f", a limit passed by {flight.violation:.2%}"
             lines.append(f"  flight {k + 1}: {told}: {true}" + (" (best)" * (k == self.best)))
         return "\n".join(lines)
 
