@@ -106,6 +106,18 @@ def test_means_are_over_time_whatever_the_samples(plant):
         assert slope @ way == pytest.approx((ends[0] - ends[1]) / (2 * e), rel=1e-6)
 
 
+def test_the_record_is_scored_as_loops_would_have_been_that_ended_early(plant):
+    time = np.arange(0, 20.01, 0.1)
+    run = driven(plant, time)
+    for start in (None, 6.0):
+        settings = package.SweepSettings(loop=package.ClosedLoopSettings(start_up=4.0), start=start)
+        lines = [
+            package.sweep(plant, [run], {"law": law}, settings=settings).recorded.figures
+            for law in (LAW, replace(LAW, kp=-80.0))
+        ]
+        assert lines[0] == lines[1]
+
+
 def test_winds_of_weights_are_speeds_in_steps():
     time = np.arange(0, 10.0)
 

@@ -387,11 +387,19 @@ def _recorded(
     figures, maxima = [], []
     for i, run in enumerate(runs):
         done = [loops[i].span for loops in rolled if loops[i].ending is None]
-        part = run.window(*(done[0] if done else (None, None))).select(names)
+        part = run.window(*(done[0] if done else _scored(run, settings))).select(names)
         figures.append(case_figures(part))
         maxima.append(channel_maxima(part, settings.extremes, settings.block))
     swept = _over_all(RECORDED, tuple(figures), (), cases.weights, settings, units)
     return replace(swept, extremes=_extremes(maxima, cases, settings))
+
+
+def _scored(run: Trajectory, settings: SweepSettings) -> tuple[float, float | None]:
+    """What would have been scored of a run whose loops all ended early."""
+    begins, start_up = float(run.time[0]), settings.loop.start_up
+    if settings.start is not None:
+        begins = max(begins, settings.start - start_up)
+    return begins + start_up, settings.stop
 
 
 def _over_all(
