@@ -113,6 +113,32 @@ def test_on_the_host_and_among_others_it_is_the_same(model):
     assert np.ptp([m[0].trajectory["q"][5] for m in many[:3]]) > 0.1
 
 
+class Remembering:
+    """A PI that keeps its integral in itself, and begins with what was given once."""
+
+    measurements, measurement_units = ("q",), ("deg",)
+    commands, command_units, interval = ("u0",), ("N",), 0.1
+
+    def __init__(self):
+        self.integral = 0.0
+
+    def start(self, measurements, commands):
+        return None
+
+    def step(self, state, measurements, time):
+        self.integral -= 0.05 * measurements[0]
+        return None, [self.integral - 0.5 * measurements[0]]
+
+
+def test_a_controller_that_keeps_its_state_in_itself_has_one_for_every_loop(model):
+    runs = [run_of(model, x0=(x, 0.0), name=f"from {x:g}") for x in (1.0, -2.0, 3.0)]
+    alone = [quietly(model, run, Remembering(), settings=AT_ONCE) for run in runs]
+    used = Remembering()
+    for law in (used, used, dfsm.Actuator(Remembering(), rate=np.inf)):
+        for one, of_many in zip(alone, quietly(model, runs, law, settings=AT_ONCE), strict=True):
+            np.testing.assert_array_equal(of_many.trajectory.values, one.trajectory.values)
+
+
 def test_nothing_of_the_record_after_the_start_enters_but_disturbances(model):
     run = run_of(model, disturbed=1.0, commanded=0.3)
     values = run.values.copy()

@@ -201,3 +201,46 @@ def test_a_sensor_filters_delays_and_disturbs():
 def test_what_cannot_be_is_told(make, sentence):
     with pytest.raises(DfsmError, match=sentence):
         make()
+
+
+LINEAR = StateSpace(A=[[0.9]], B=[[0.1]], C=[[-5.0]], D=[[0.2]], **NAMES)
+SCHEDULED = replace(
+    PI, measurements=("y", "v"), measurement_units=("rpm", "m/s"), points=[0.0, 1.0]
+)
+
+
+@pytest.mark.parametrize(
+    ("law", "sentence"),
+    [
+        (replace(SCHEDULED, kp=[1, 2, 3]), r"kp of shape is \(3,\), expected a number or shape"),
+        (replace(PI, kp=[1, 2]), r"kp of shape is \(2,\), expected a number$"),
+        (replace(PI, setpoint=[1, 2]), r"setpoint of shape is \(2,\), expected a number$"),
+        (replace(LINEAR, y0=[1, 2]), r"y0 of shape is \(2,\), .* or shape \(1,\): one per meas"),
+        (replace(LINEAR, limits=([0, 0], [1, 1])), r"limits of shape is \(2,\), .* per command"),
+        (Actuator(PI, corner=[1, 2]), r"corner of shape is \(2,\), expected a number$"),
+        (Sensor(PI, noise=[1, 2]), r"noise of shape is \(2,\), .* one per measurement that it is"),
+    ],
+)
+def test_shapes_are_told_where_a_loop_begins(law, sentence):
+    with pytest.raises(DfsmError, match=sentence):
+        law.start(jnp.zeros(len(law.measurements)), jnp.zeros(1))
+
+
+def test_gains_that_a_function_is_mapped_over_have_an_axis_more():
+    gains = replace(PI, kp=jnp.array([1.0, 2.0]))
+    axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, gains)
+    starts = jax.vmap(lambda one: one.start(jnp.zeros(1), jnp.zeros(1)).integral, in_axes=(axes,))
+    np.testing.assert_allclose(starts(gains), [-1.05, -2.05])
+
+
+def test_limits_may_be_lists_and_nothing_begins_wound_up_beyond_them():
+    listed = replace(LINEAR, limits=([-0.5], [0.5]))
+    np.testing.assert_array_equal(
+        told(listed, np.ones(40))[0], told(replace(LINEAR, limits=(-0.5, 0.5)), np.ones(40))[0]
+    )
+    law = StateFeedback(
+        gain=[[1.0]], integral_gain=[[1.0]], x0=[0.0], u0=[0.0], limits=(0.0, 4.0), **NAMES
+    )
+    # The plant's control stands far beyond; once the error leads away the command follows at once.
+    commands, _ = told(law, np.array([0.0, 0.5, 0.5]), (30.0,))
+    np.testing.assert_allclose(commands[:, 0], [4.0, 3.45, 3.4])

@@ -340,6 +340,12 @@ class _Decides(PID):
         return state, jnp.array([1.0 if measurements[0] > 0 else 0.0])
 
 
+def test_numbers_that_are_no_fields_cannot_be_gains():
+    sentence = "SimpleNamespace has no numbers that could be replaced by name, as 'kp': declare"
+    with pytest.raises(DfsmError, match=sentence):
+        gain_grid(own(kp=1.0), {"kp": [1.0, 2.0]})
+
+
 def test_a_step_that_jax_cannot_follow_is_told_with_a_cure(model):
     law = _Decides(kp=1.0, ki=0.0, setpoint=0.0, **NAMES)
     with pytest.raises(DfsmError, match=r"step fails with Tracer.*jnp.where in place of if"):

@@ -6,7 +6,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import fatpack
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from conftest import write_config
 from dfsm.errors import DfsmError
 from dfsm.loops.measures import KINDS
 from dfsm.loops.tuning import TuningTask
+from dfsm.loops.tuning_folder import fingerprint
 from dfsm.loops.tuning_problem import Goal, Limit
 from dfsm.numerics.fatigue import damage_equivalent_load
 from dfsm.numerics.fatigue_slope import damage_with_slope
@@ -93,6 +96,27 @@ def test_every_measure_has_the_slope_that_differences_have(asked):
         np.testing.assert_allclose(found.slopes[:, :, i], numeric, atol=1e-7)
         costs = [search.judged(end).objective for end in ends]
         assert judged.slope[i] == pytest.approx((costs[0] - costs[1]) / (2 * e), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("interval", "sampling"), [(0.1, 0.1), (0.4, 0.1), (0.4, 0.05), (0.1, 0.4)]
+)
+def test_the_rate_of_a_command_is_from_one_to_the_next(interval, sampling):
+    model, law = task().model, replace(LAW, interval=interval)
+    time = np.arange(0, 20.001, sampling)
+    inputs = np.stack([0 * time, np.sin(1.7 * time)], axis=1)
+    run = driving_run(model, time, inputs, np.tile([0.5, 0], (len(time), 1)), "r")
+    rate = Goal(measure="rate", channel="u0")
+    problem = package.TuningProblem(parameters={"kp": (-3.0, 3.0)}, objective=(rate,))
+    own = TuningTask(model, [run], law, problem, None, None, SETTINGS)
+    at = own.tuned.start
+    found = own.evaluator(at, slopes=True)
+    u, every = own.evaluator.loops(at)[0].trajectory["u0"], max(1, round(interval / sampling))
+    expected = np.abs(np.diff(u[::every])).max() / max(interval, sampling)
+    assert found.figures.item() == pytest.approx(expected, rel=1e-6)
+    ends = [own.evaluator(at + s).figures.item() for s in (1e-6, -1e-6)]
+    assert found.slopes is not None
+    assert found.slopes.item() == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
 
 
 def test_the_optimum_is_that_of_a_grid_and_limits_hold(tmp_path):
@@ -224,3 +248,44 @@ def test_the_command_tunes_and_goes_on_where_it_was_ended(here, dfsm, fitted):
         write_config(Path("bad.yaml"), config | change)
         assert sentence in dfsm("tune", "bad.yaml", "-o", "other").sentence
     assert not Path("other").exists()
+
+
+class Lagging(eqx.Module):
+    """Proportional, with a lag and a table that only the code knows."""
+
+    lag: float = eqx.field(static=True)
+    table: tuple[float, ...] = eqx.field(static=True)
+    kp: float = 0.2
+    measurements = ("q",)
+    measurement_units = ("m",)
+    commands = ("u0",)
+    command_units = ("N",)
+    interval = 0.1
+
+    def start(self, measurements, commands):
+        return measurements
+
+    def step(self, state, measurements, time):
+        error = jnp.interp(state[0], np.array([-9.0, 0.0, 9.0]), np.array(self.table))
+        return state + (measurements - state) * self.lag, -self.kp * jnp.stack([error])
+
+
+def test_what_was_computed_is_taken_over_for_the_same_loop_only():
+    one = task()
+
+    def mark(law, name):
+        asked = replace(ASKED, parameters={name: (-3.0, 3.0)})
+        return fingerprint(TuningTask(one.model, one.runs, law, asked, None, None, SETTINGS))
+
+    laws = [
+        *(package.Sensor(LAW, delay=delay) for delay in (0.2, 0.5)),
+        *(package.Sensor(LAW, noise=0.1, seed=seed) for seed in (1, 2)),
+        package.Sensor(replace(LAW, measurement_units=("cm",))),
+        package.Sensor(replace(LAW, kd=0.1, smoothing=1.0)),
+        *(package.Sensor(Lagging(lag, (-9.0, 0.0, 9.0))) for lag in (0.5, 0.6)),
+        package.Sensor(Lagging(0.5, (-9.0, 0.0, 8.0))),
+    ]
+    marks = [mark(law, "inner.kp") for law in laws]
+    assert len(set(marks)) == len(laws)
+    assert mark(package.Sensor(Lagging(0.5, (-9.0, 0.0, 9.0))), "inner.kp") == marks[6]
+    assert fingerprint(one) == fingerprint(task())

@@ -12,7 +12,14 @@ import dfsm
 from benchmarks import tuning
 from dfsm.data.readers.tables import write_table
 from dfsm.errors import DfsmError
-from dfsm.loops.trust_region import Confirmation, CorrectedFigures, TrustSettings, tune_with_truth
+from dfsm.loops.trust_region import (
+    Confirmation,
+    ConfirmedTuning,
+    CorrectedFigures,
+    Flight,
+    TrustSettings,
+    tune_with_truth,
+)
 from dfsm.loops.truth import FlownRuns, SystemTruth, TruthCase, TruthEndedError, exact_model
 
 
@@ -102,3 +109,13 @@ def test_a_flight_that_ends_early_makes_the_region_smaller(task):
     assert found.flights[2].radius <= found.flights[1].radius / 2
     assert found.best == 2
     assert "ended early" in found.summary()
+
+
+def test_a_flight_that_passes_a_limit_in_truth_says_so():
+    flights = (
+        Flight({"kp": 1.0}, None, 1.0, 1.0, 5e-5, 0.5),
+        Flight({"kp": 2.0}, 0.8, 0.9, 0.85, 0.003, 0.5),
+    )
+    _, first, second = ConfirmedTuning(Confirmation.LIMIT, flights, 1, None).summary().splitlines()
+    assert first.endswith("kp = 1: 1")
+    assert second.endswith("0.85, predicted 0.8, a limit passed by 0.30% (best)")

@@ -52,6 +52,7 @@ def sweep(
             found.runs,
             controllers,
             weights=asked.shares(found.runs),
+            conditions=asked.alike(found.runs),
             measurements=asked.measure,
             settings=asked.settings(fit_start(found.model)),
         )

@@ -118,12 +118,13 @@ def explain(
     if first["type"] == "value_error":
         # Raised by a settings class itself, already one sentence.
         return str(first.get("ctx", {}).get("error", first["msg"]))
-    keys = _path(first["loc"], raw)
+    lost = first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument")
+    keys = _path(first["loc"], raw) if lost else _place(first["loc"], raw)
     where = prefix + _written(keys)
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _known_keys(keys[:-1], raw, kind)
         return f"unknown key '{where}'; {near_matches(str(keys[-1]), known)}"
-    if first["type"] in ("missing", "missing_argument", "missing_keyword_only_argument"):
+    if lost:
         return f"key '{where}' is missing"
     if first["type"].startswith("union_tag"):
         kinds = ", ".join(f"'{k}'" for k in _kinds(keys, kind))
@@ -137,6 +138,18 @@ def explain(
         value += ", which has a decimal comma: write a point"
     message = _MESSAGES.get(first["type"], first["msg"])
     return f"'{where}': {message[0].lower()}{message[1:]}{value}"
+
+
+def _place(loc: tuple[int | str, ...], raw: Any) -> list[int | str]:
+    """Path of a key that is there, without names of union members, its last one included."""
+    node, keys = raw, list[int | str]()
+    for key in loc:
+        try:
+            node = node[key]
+        except (KeyError, IndexError, TypeError):
+            continue
+        keys.append(key)
+    return keys
 
 
 # Where pydantic speaks of Python, in the words of a configuration file.
@@ -202,11 +215,15 @@ def _children(schema: dict[str, Any], node: dict[str, Any], key: int | str) -> l
         child = node.get("additionalProperties")
     if not isinstance(child, dict):
         return []
-    options = child.get("oneOf") or child.get("anyOf") or [child]
-    resolved = [_resolve(schema, o) for o in options]
-    return [r for r in resolved if isinstance(r, dict)]
+    return list(_options(schema, child))
 
 
-def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+def _options(schema: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """What a node may be, where it may be one of several things, of which each may be."""
     reference = node.get("$ref")
-    return schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node
+    node = schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node
+    several = node.get("oneOf") or node.get("anyOf")
+    if several is None:
+        yield node
+    for option in several or ():
+        yield from _options(schema, option)

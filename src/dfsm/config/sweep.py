@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 
 from pydantic import Field
 
-from dfsm.config.loops import LoopsConfig
+from dfsm.config.loops import LoopsConfig, Weibull
 from dfsm.config.parse import parse_file
+from dfsm.data.trajectory import Trajectory
 from dfsm.loops.load_cases import require_counted
 from dfsm.loops.sweep import SweepSettings
 
@@ -26,6 +28,9 @@ class SweepConfig(LoopsConfig):
         See `SweepSettings`.
     exponent
         Wöhler exponent of the loads in tables.
+    conditions
+        What each run is a case of, as for `sweep`; default the winds that weights follow, or every
+        run a condition of its own.
     """
 
     gains: dict[str, list[float]] = Field(default_factory=dict)
@@ -36,6 +41,13 @@ class SweepConfig(LoopsConfig):
     block: float = SweepSettings.block
     years: float = SweepSettings.years
     exponent: float = 4.0
+    conditions: list[float | str] | None = None
+
+    def alike(self, runs: Sequence[Trajectory]) -> Sequence[Hashable] | None:
+        """The condition of every run; None where nobody told."""
+        if self.conditions is None and isinstance(self.weights, Weibull):
+            return self.weights.winds(runs)
+        return self.conditions
 
     def settings(self, start: float | None) -> SweepSettings:
         """What is told; `start` is that of the fit, where the file names none.

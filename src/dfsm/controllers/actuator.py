@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import require_texts
-from dfsm.controllers.fields import numbers, require_limits, require_numbers
+from dfsm.controllers.fields import (
+    numbers,
+    pair_of,
+    require_limits,
+    require_numbers,
+    require_shapes,
+)
 from dfsm.controllers.rosco_blocks import within
 from dfsm.controllers.traced import traced
 from dfsm.controllers.wrapper import Wrapper
@@ -57,7 +63,7 @@ class Actuator(Wrapper):
     corner: jax.Array | None = eqx.field(converter=numbers("corner", optional=True), default=None)
     damping: jax.Array = eqx.field(converter=numbers("damping"), default=0.7)  # pyright: ignore[reportAssignmentType]
     rate: jax.Array = eqx.field(converter=numbers("rate"), default=np.inf)  # pyright: ignore[reportAssignmentType]
-    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+    limits: tuple[Any, Any] = eqx.field(converter=pair_of, default=(-jnp.inf, jnp.inf))
     acts_on: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
@@ -75,6 +81,8 @@ class Actuator(Wrapper):
     def start(self, measurements: jax.Array, commands: jax.Array) -> ActuatorState:
         """At rest where the plant's controls are; see `Controller.start`."""
         position = commands[self._columns]
+        require_shapes(self, "corner damping", None)
+        require_shapes(self, "rate limits", len(self._columns), "command that it is for")
         moves = jnp.zeros((2, 2))
         if self.corner is not None:
             square, slope = self.corner**2, 2 * self.damping * self.corner
@@ -89,6 +97,7 @@ class Actuator(Wrapper):
     ) -> tuple[ActuatorState, jax.Array]:
         """Next state, and commands; see `Controller.step`."""
         inner, commands = self.inner.step(state.inner, measurements, time)
+        commands = jnp.asarray(commands, dtype=float)
         wanted = commands[self._columns]
         position, velocity = wanted, state.velocity
         if self.corner is not None:
@@ -108,4 +117,4 @@ class Actuator(Wrapper):
     @property
     def _columns(self) -> Any:
         chosen = self.inner.commands if self.acts_on is None else self.acts_on
-        return np.array([self.inner.commands.index(n) for n in chosen])
+        return np.array([self.inner.commands.index(n) for n in chosen], dtype=int)

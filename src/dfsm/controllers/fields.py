@@ -88,3 +88,41 @@ def require_limits(limits: Any, equal: bool = False) -> None:
         rising = bool(((low <= high) if equal else (low < high)).all())
         limits = (low.tolist(), high.tolist())
     require(rising, "limits", shown(limits), "the lower one first, then the higher one")
+
+
+def pair_of(limits: Any) -> Any:
+    """Limits of which each may be a list; what is no pair stays, for `require_limits` to refuse."""
+    if not isinstance(limits, list | tuple) or len(limits) != 2:
+        return limits
+    return tuple(numbers("limits")(x) if isinstance(x, list | tuple) else x for x in limits)
+
+
+def require_shapes(controller: Any, names: str, count: int | None, of_what: str = "") -> None:
+    """Refuse fields that are neither a number nor one number for each of some things.
+
+    To be asked where a loop begins, not where a controller is made: fields of one that a function
+    is mapped over have an axis more.
+
+    Parameters
+    ----------
+    controller
+        Whose fields they are.
+    names
+        Of the fields, with spaces between; None will do, and of a pair of limits each counts.
+    count
+        How many things there are; None for a number alone.
+    of_what
+        What they are.
+
+    Raises
+    ------
+    DfsmError
+        Names the field and its shape.
+    """
+    expected = "a number" if count is None else f"a number or shape ({count},): one per {of_what}"
+    for name in names.split():
+        value = getattr(controller, name)
+        for part in value if isinstance(value, tuple) else (value,):
+            shape = np.shape(part) if part is not None else ()
+            good = shape == () or (count is not None and shape == (count,))
+            require(good, f"{name} of shape", shape, expected)

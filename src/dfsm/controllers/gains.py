@@ -84,6 +84,12 @@ def find_gain(controller: Any, name: str) -> Gain:
         leaf = name.removesuffix(_FACTOR)
     elif (indexed := _INDEXED.fullmatch(name)) is not None:
         leaf, index = indexed.group(1), tuple(int(i) for i in indexed.group(2).split(","))
+    if not known:
+        raise DfsmError(
+            f"{type(controller).__name__} has no numbers that could be replaced by name, as "
+            f"'{leaf}': declare them as fields of an equinox module, `{leaf}: float = 1.0`, or of "
+            "a dataclass, which a sweep takes too"
+        )
     if leaf not in known:
         raise DfsmError(f"the controller has no gain '{leaf}'; {near_matches(leaf, known)}")
     values = np.asarray(known[leaf], dtype=np.float64)

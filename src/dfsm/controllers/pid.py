@@ -10,7 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import require_controller
-from dfsm.controllers.fields import numbers, require_limits, require_numbers, texts
+from dfsm.controllers.fields import (
+    numbers,
+    pair_of,
+    require_limits,
+    require_numbers,
+    require_shapes,
+    texts,
+)
 from dfsm.controllers.rosco_blocks import lookup, unwound, within
 from dfsm.controllers.traced import traced
 from dfsm.core.settings import require, require_number
@@ -54,7 +61,7 @@ class PID(eqx.Module):
     DfsmError
         What `require_controller` refuses; other than one command, or one measurement and one that a
         schedule follows; numbers that are none or not finite, limits the wrong way round, or
-        points that do not rise.
+        points that do not rise. Where a loop begins: gains that are not one per point.
     """
 
     kp: jax.Array = eqx.field(converter=numbers("kp"))
@@ -66,7 +73,7 @@ class PID(eqx.Module):
     interval: float = eqx.field(static=True)
     setpoint: jax.Array = eqx.field(converter=numbers("setpoint"))
     kd: jax.Array = eqx.field(converter=numbers("kd"), default=0.0)  # pyright: ignore[reportAssignmentType]
-    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+    limits: tuple[Any, Any] = eqx.field(converter=pair_of, default=(-jnp.inf, jnp.inf))
     points: jax.Array | None = eqx.field(converter=numbers("points", optional=True), default=None)
     smoothing: float = eqx.field(static=True, default=0.0)
 
@@ -86,7 +93,7 @@ class PID(eqx.Module):
         require_numbers(self, "kp ki kd setpoint points", "a finite number")
         require_limits(self.limits)
         if self.points is not None:
-            rising = bool((np.diff(np.asarray(self.points)) > 0).all())
+            rising = self.points.ndim > 0 and bool((np.diff(np.asarray(self.points)) > 0).all())
             require(rising, "points", np.asarray(self.points).tolist(), "values that rise")
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> PIDState:
@@ -97,6 +104,9 @@ class PID(eqx.Module):
         measurements, commands
             Shapes ``(measurement,)`` and ``(1,)``.
         """
+        require_shapes(self, "setpoint limits", None)
+        points = None if self.points is None else len(self.points)
+        require_shapes(self, "kp ki kd", points, "point of the schedule")
         y = measurements[0]
         kp = self._gain(self.kp, measurements)
         step = self.interval * self._gain(self.ki, measurements) * (self.setpoint - y)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.controller import require_texts
-from dfsm.controllers.fields import numbers, require_numbers
+from dfsm.controllers.fields import numbers, require_numbers, require_shapes
 from dfsm.controllers.traced import traced
 from dfsm.controllers.wrapper import Wrapper
 from dfsm.core.settings import require_number
@@ -73,6 +73,7 @@ class Sensor(Wrapper):
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> SensorState:
         """The sensor has seen these for long; see `Controller.start`."""
+        require_shapes(self, "corner noise", len(self._columns), "measurement that it is for")
         seen = measurements[self._columns]
         recent = jnp.tile(seen, (int(self.delay / self.interval * (1 + 1e-9)) + 2, 1))
         return SensorState(self.inner.start(measurements, commands), recent, jnp.zeros((), int))
@@ -99,4 +100,4 @@ class Sensor(Wrapper):
     @property
     def _columns(self) -> Any:
         chosen = self.inner.measurements if self.acts_on is None else self.acts_on
-        return np.array([self.inner.measurements.index(n) for n in chosen])
+        return np.array([self.inner.measurements.index(n) for n in chosen], dtype=int)

@@ -12,7 +12,14 @@ import scipy
 from numpy.typing import ArrayLike
 
 from dfsm.controllers.controller import INTERVAL, require_controller
-from dfsm.controllers.fields import numbers, require_limits, require_numbers, texts
+from dfsm.controllers.fields import (
+    numbers,
+    pair_of,
+    require_limits,
+    require_numbers,
+    require_shapes,
+    texts,
+)
 from dfsm.controllers.rosco_blocks import unwound, within
 from dfsm.controllers.traced import traced
 from dfsm.core.settings import require, require_number
@@ -55,7 +62,7 @@ class StateSpace(eqx.Module):
     interval: float = eqx.field(static=True)
     y0: jax.Array = eqx.field(converter=numbers("y0"), default=0.0)  # pyright: ignore[reportAssignmentType]
     u0: jax.Array = eqx.field(converter=numbers("u0"), default=0.0)  # pyright: ignore[reportAssignmentType]
-    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+    limits: tuple[Any, Any] = eqx.field(converter=pair_of, default=(-jnp.inf, jnp.inf))
 
     def __check_init__(self) -> None:
         require_controller(self)
@@ -70,6 +77,8 @@ class StateSpace(eqx.Module):
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> jax.Array:
         """State whose command is this one, and among those the one nearest to rest."""
+        require_shapes(self, "y0", len(self.measurements), "measurement")
+        require_shapes(self, "u0 limits", len(self.commands), "command")
         y = measurements - self.y0
         push, away = self.B @ y, jnp.eye(len(self.A)) - self.A
         inverse = jnp.linalg.pinv(self.C)
@@ -127,7 +136,7 @@ class StateFeedback(eqx.Module):
     integral_gain: jax.Array | None = eqx.field(
         converter=numbers("integral_gain", optional=True), default=None
     )
-    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf)
+    limits: tuple[Any, Any] = eqx.field(converter=pair_of, default=(-jnp.inf, jnp.inf))
 
     def __check_init__(self) -> None:
         require_controller(self)
@@ -141,12 +150,17 @@ class StateFeedback(eqx.Module):
             require_limits(self.limits, equal=True)
 
     def start(self, measurements: jax.Array, commands: jax.Array) -> jax.Array:
-        """What integrals add to the commands, such that the first step continues these."""
+        """What integrals add to the commands, such that the first step continues these.
+
+        As far as the limits allow: nothing is wound up beyond.
+        """
+        require_shapes(self, "x0", len(self.measurements), "measurement")
+        require_shapes(self, "u0 limits", len(self.commands), "command")
         if self.integral_gain is None:
             return jnp.zeros(0)
         error = measurements - self.x0
         step = self.interval * self.integral_gain @ error
-        return commands - (self.u0 - self.gain @ error - step)
+        return within(commands, *self.limits) - (self.u0 - self.gain @ error - step)
 
     def step(
         self,

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from dfsm.core.settings import require, require_list, require_number, shown
+from dfsm.core.settings import require, require_kind, require_list, require_number, shown
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.numerics.fatigue import WOHLER_EXPONENTS, damage_by_exponent
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 
 HOURS_PER_YEAR = 8766.0
 
@@ -25,7 +26,7 @@ class Figures:
     Attributes
     ----------
     mean, std
-        In the channel's unit; of all: over their common life.
+        Over time, in the channel's unit; of all: over their common life.
     minimum, maximum
         Extremes.
     travel
@@ -43,12 +44,12 @@ class Figures:
     damage: Mapping[str, float]
 
     @classmethod
-    def of(cls, time: Array, values: Array) -> Figures:
-        """Figures of one signal, ``(time,)``."""
+    def of(cls, time: Array, values: Array, weights: Array | None = None) -> Figures:
+        """Figures of one signal, ``(time,)``; `weights` as of `weights_over_time`."""
         duration = float(time[-1] - time[0])
         return cls(
-            mean=float(values.mean()),
-            std=float(values.std()),
+            mean=float(mean_over(values, weights)),
+            std=float(std_over(values, weights)),
             minimum=float(values.min()),
             maximum=float(values.max()),
             travel=float(np.abs(np.diff(values)).sum() / duration),
@@ -78,7 +79,8 @@ class Figures:
 
 def case_figures(run: Trajectory) -> dict[str, Figures]:
     """Figures of every channel of a run."""
-    return {name: Figures.of(run.time, run[name]) for name in run.names}
+    weights = weights_over_time([run.time])
+    return {name: Figures.of(run.time, run[name], weights) for name in run.names}
 
 
 def require_counted(exponent: float) -> None:
@@ -114,6 +116,71 @@ def require_weights(weights: Any, runs: int | None = None) -> None:
     require(many, "weights", shown(list(weights)), expected)
     for weight in weights:
         require_number("one of the weights", weight, "a number above 0", above=0)
+
+
+def require_shares(weights: Sequence[float]) -> None:
+    """Refuse weights, numbers above 0, that are in no proportion to the year.
+
+    Raises
+    ------
+    DfsmError
+        They add up to more than all of the time.
+    """
+    total = sum(weights)
+    # Tables are rounded.
+    if total > 1.01:
+        raise DfsmError(
+            f"weights add up to {total:g}, expected shares of the time, at most 1 in all, where "
+            "energy or extremes are asked for: divide them by 100 if they are percent, by 8766 if "
+            "they are hours of a year"
+        )
+
+
+@dataclass(frozen=True)
+class LoadCases:
+    """Shares of the time that runs stand for, and which of them are seeds of one condition.
+
+    Attributes
+    ----------
+    weights
+        Of the runs.
+    groups
+        Which runs make up each condition.
+    """
+
+    weights: tuple[float, ...]
+    groups: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, weights: Sequence[float], conditions: Sequence[Hashable] | None) -> LoadCases:
+        """Group runs by the condition that each is a case of; None for one each.
+
+        Raises
+        ------
+        DfsmError
+            Conditions are not one per run.
+        """
+        runs = len(weights)
+        if conditions is None:
+            return cls(tuple(weights), tuple((i,) for i in range(runs)))
+        expected = f"one per run, {runs}, as [6, 6, 12] for two seeds at 6 m/s and one at 12"
+        require_list("conditions", conditions, expected)
+        require(len(conditions) == runs, "conditions", shown(list(conditions)), expected)
+        for condition in conditions:
+            require_kind("one of the conditions", condition, Hashable, "a number or a text")
+        alike: dict[Hashable, list[int]] = {}
+        for i, condition in enumerate(conditions):
+            alike.setdefault(condition, []).append(i)
+        return cls(tuple(weights), tuple(map(tuple, alike.values())))
+
+    @property
+    def shares(self) -> list[float]:
+        """Share of the time of every condition."""
+        return [sum(self.weights[i] for i in group) for group in self.groups]
+
+    def pooled(self, values: Sequence[Array]) -> list[Array]:
+        """Values of all runs, each ``(n,)``, by condition."""
+        return [np.concatenate([values[i] for i in group]) for group in self.groups]
 
 
 def weibull_weights(winds: Sequence[float], mean: float, shape: float = 2.0) -> list[float]:

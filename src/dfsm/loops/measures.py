@@ -11,6 +11,7 @@ from dfsm.core.settings import require, require_kind, require_number, settings_c
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError, near_matches
 from dfsm.numerics.fatigue_slope import damage_with_slope
+from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
 
 Kind = Literal["mean", "std", "maximum", "minimum", "overshoot", "travel", "rate", "damage"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -79,13 +80,16 @@ class Measure:
             return ""
         return f"{of_channel}/s" if self.measure in ("travel", "rate") else of_channel
 
-    def along(self, time: Array, values: Array) -> tuple[float, Array]:
+    def along(self, time: Array, values: Array, held: float = 0.0) -> tuple[float, Array]:
         """Figure of one run, and its slope with every sample.
 
         Parameters
         ----------
         time, values
             Shapes ``(time,)``.
+        held
+            Seconds for which a command is held: a rate is that from one command to the next,
+            however short the samples are in between.
 
         Returns
         -------
@@ -93,35 +97,44 @@ class Measure:
             The figure, and its derivative with respect to the values, shape ``(time,)``; that of an
             extreme belongs to the sample where it is.
         """
-        n, duration = len(values), float(time[-1] - time[0])
-        slope = np.zeros(n)
-        if self.measure == "mean":
-            return float(values.mean()), slope + 1 / n
-        if self.measure == "std":
-            size = float(values.std())
-            return size, (values - values.mean()) / (n * size) if size else slope
+        duration, slope = float(time[-1] - time[0]), np.zeros(len(values))
+        if self.measure in ("mean", "std"):
+            return self._over_time(time, values)
         if self.measure == "damage":
             return damage_with_slope(values, duration, self.exponent)
         if self.measure in ("travel", "rate"):
-            return self._of_rates(time, values)
+            return self._of_rates(time, values, held)
         at = int(np.argmin(values) if self.measure == "minimum" else np.argmax(values))
         slope[at] = 1.0
         if self.reference is not None:
             return float(values[at]) / self.reference - 1, slope / self.reference
         return float(values[at]), slope
 
-    def _of_rates(self, time: Array, values: Array) -> tuple[float, Array]:
-        steps, lasting = np.diff(values), np.diff(time)
-        ways, slope = np.sign(steps), np.zeros(len(values))
+    def _over_time(self, time: Array, values: Array) -> tuple[float, Array]:
+        weights = weights_over_time([time])
+        shares = np.ones(len(values)) if weights is None else weights
+        shares, mean = shares / shares.sum(), float(mean_over(values, weights))
+        if self.measure == "mean":
+            return mean, shares
+        size = float(std_over(values, weights))
+        return size, shares * (values - mean) / size if size else 0 * shares
+
+    def _of_rates(self, time: Array, values: Array, held: float) -> tuple[float, Array]:
+        slope = np.zeros(len(values))
         if self.measure == "travel":
-            duration = float(time[-1] - time[0])
-            slope[1:] += ways / duration
-            slope[:-1] -= ways / duration
+            steps, duration = np.diff(values), float(time[-1] - time[0])
+            ways = np.sign(steps) / duration
+            slope[1:] += ways
+            slope[:-1] -= ways
             return float(np.abs(steps).sum() / duration), slope
-        rates = np.abs(steps) / lasting
-        at = int(np.argmax(rates))
-        slope[at + 1], slope[at] = ways[at] / lasting[at], -ways[at] / lasting[at]
-        return float(rates[at]), slope
+        first = np.arange(len(time) - 1)
+        after = np.searchsorted(time, time[:-1] + held * (1 - 1e-6))
+        after = np.minimum(np.maximum(after, first + 1), len(time) - 1)
+        rates = (values[after] - values[first]) / np.maximum(time[after] - time[first], held)
+        at = int(np.argmax(np.abs(rates)))
+        per_value = np.sign(rates[at]) / max(time[after[at]] - time[at], held)
+        slope[after[at]], slope[at] = per_value, -per_value
+        return float(abs(rates[at])), slope
 
     def over(self, figures: Sequence[float], weights: Sequence[float]) -> tuple[float, Array]:
         """Figure of several runs, and its slope with theirs.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -27,16 +27,18 @@ from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed, missing
+from dfsm.loops.extremes import Extreme, channel_maxima, long_term_extremes
 from dfsm.loops.load_cases import (
     HOURS_PER_YEAR,
     Figures,
+    LoadCases,
     case_figures,
     require_counted,
+    require_shares,
     require_weights,
 )
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.numerics.extremes import block_maxima, extrapolated, fit_gumbel
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, reduced_loops
 from dfsm.simulation.loop_cases import ClosedLoopSettings, checked_loops
 
@@ -92,23 +94,6 @@ class SweepSettings:
         require(both, "rated_speed", self.rated_speed, "a value where speed is set, else none")
         require_number("rated_speed", self.rated_speed, "more than 0", above=0, optional=True)
         require_texts("extremes", self.extremes)
-
-
-@dataclass(frozen=True)
-class Extreme:
-    """A largest value, extrapolated.
-
-    Attributes
-    ----------
-    value, error
-        What is exceeded once in the time asked for, and its standard error, in the channel's unit.
-    blocks
-        Maxima from which it comes.
-    """
-
-    value: float
-    error: float
-    blocks: int
 
 
 @dataclass(frozen=True)
@@ -215,6 +200,7 @@ def sweep(
     controllers: Mapping[str, Controller],
     *,
     weights: Sequence[float] | None = None,
+    conditions: Sequence[Hashable] | None = None,
     measurements: Mapping[str, str] | None = None,
     settings: SweepSettings | None = None,
 ) -> Sweep:
@@ -230,6 +216,10 @@ def sweep(
         By the name under which each is shown.
     weights
         Share of the time that each run stands for, see `weibull_weights`; equal by default.
+    conditions
+        What each run is a case of, its mean wind say: maxima of runs of one condition, which differ
+        in their seeds, are those of one distribution. By default every run is a condition of its
+        own, and the more there are, the further the luckiest fit carries the extremes.
     settings
         Time window, and which signals are power and speed.
 
@@ -240,8 +230,10 @@ def sweep(
     Raises
     ------
     DfsmError
-        As `closed_loop`; or weights that are not one positive number per run, no controllers, one
-        without a name or with the record's, or a power or speed that the model does not have.
+        As `closed_loop`; or weights that are not one positive number per run, or not shares of the
+        time where energy or extremes are asked for, conditions that are not one per run, no
+        controllers, one without a name or with the record's, or a power or speed that the model
+        does not have.
     """
     require_kind("settings", settings, SweepSettings | None, "dfsm.SweepSettings(…)")
     settings = settings or SweepSettings()
@@ -255,6 +247,9 @@ def sweep(
     weights = [1 / len(runs)] * len(runs) if weights is None else weights
     require_weights(weights, len(runs))
     weights = [float(w) for w in weights]
+    if settings.power is not None or settings.extremes:
+        require_shares(weights)
+    cases = LoadCases.of(weights, conditions)
     s = model.signals
     units = {c.name: c.unit for c in (*s.states, *s.controls, *s.outputs)}
     named = [n for n in (settings.power, settings.speed, *settings.extremes) if n is not None]
@@ -272,8 +267,8 @@ def sweep(
             settings=settings.loop,
         )
     loops = dict(zip(controllers, rolled, strict=True))
-    swept = tuple(_swept(n, loops[n], weights, settings, units) for n in controllers)
-    recorded = _recorded(runs, rolled, weights, settings, units)
+    swept = tuple(_swept(n, loops[n], cases, settings, units) for n in controllers)
+    recorded = _recorded(runs, rolled, cases, settings, units)
     return Sweep(swept, recorded, tuple(r.name for r in runs), tuple(weights), units)
 
 
@@ -353,57 +348,37 @@ class _Loop:
         span = (float(run.time[0]), float(run.time[-1]))
         if loop.status is not LoopStatus.COMPLETED:
             return cls(span, f"{run.name}: {loop.message}", None, {})
-        return cls(span, None, case_figures(run), _maxima(run, settings))
-
-
-def _maxima(run: Trajectory, settings: SweepSettings) -> dict[str, Array]:
-    found = {}
-    for name in settings.extremes:
-        if name in run:
-            try:
-                found[name] = block_maxima(run.time, run[name], settings.block)
-            except DfsmError as error:
-                raise DfsmError(f"extremes of {name}: {error}") from None
-    return found
+        return cls(
+            span, None, case_figures(run), channel_maxima(run, settings.extremes, settings.block)
+        )
 
 
 def _swept(
     name: str,
     loops: Sequence[_Loop],
-    weights: Sequence[float],
+    cases: LoadCases,
     settings: SweepSettings,
     units: Mapping[str, str],
 ) -> Swept:
     figures = tuple(loop.figures for loop in loops)
     endings = tuple(loop.ending for loop in loops if loop.ending is not None)
-    swept = _over_all(name, figures, endings, weights, settings, units)
+    swept = _over_all(name, figures, endings, cases.weights, settings, units)
     if endings:
         return swept
-    return replace(swept, extremes=_extremes([lp.maxima for lp in loops], weights, settings))
+    return replace(swept, extremes=_extremes([lp.maxima for lp in loops], cases, settings))
 
 
 def _extremes(
-    maxima: Sequence[Mapping[str, Array]], weights: Sequence[float], settings: SweepSettings
+    maxima: Sequence[Mapping[str, Array]], cases: LoadCases, settings: SweepSettings
 ) -> dict[str, Extreme]:
-    """Long-term extremes of the channels that all runs hold."""
-    found = {}
-    for name in settings.extremes:
-        if any(name not in of_run for of_run in maxima):
-            continue
-        try:
-            fits = [fit_gumbel(of_run[name]) for of_run in maxima]
-        except DfsmError as error:
-            raise DfsmError(f"extremes of {name}: {error}") from None
-        blocks = settings.years * HOURS_PER_YEAR * 3600 / settings.block
-        value, error = extrapolated(fits, weights, blocks)
-        found[name] = Extreme(value, error, sum(f.maxima for f in fits))
-    return found
+    blocks = settings.years * HOURS_PER_YEAR * 3600 / settings.block
+    return long_term_extremes(settings.extremes, maxima, cases, blocks)
 
 
 def _recorded(
     runs: Sequence[Trajectory],
     rolled: Sequence[Sequence[_Loop]],
-    weights: Sequence[float],
+    cases: LoadCases,
     settings: SweepSettings,
     units: Mapping[str, str],
 ) -> Swept:
@@ -412,11 +387,19 @@ def _recorded(
     figures, maxima = [], []
     for i, run in enumerate(runs):
         done = [loops[i].span for loops in rolled if loops[i].ending is None]
-        part = run.window(*(done[0] if done else (None, None))).select(names)
+        part = run.window(*(done[0] if done else _scored(run, settings))).select(names)
         figures.append(case_figures(part))
-        maxima.append(_maxima(part, settings))
-    swept = _over_all(RECORDED, tuple(figures), (), weights, settings, units)
-    return replace(swept, extremes=_extremes(maxima, weights, settings))
+        maxima.append(channel_maxima(part, settings.extremes, settings.block))
+    swept = _over_all(RECORDED, tuple(figures), (), cases.weights, settings, units)
+    return replace(swept, extremes=_extremes(maxima, cases, settings))
+
+
+def _scored(run: Trajectory, settings: SweepSettings) -> tuple[float, float | None]:
+    """What would have been scored of a run whose loops all ended early."""
+    begins, start_up = float(run.time[0]), settings.loop.start_up
+    if settings.start is not None:
+        begins = max(begins, settings.start - start_up)
+    return begins + start_up, settings.stop
 
 
 def _over_all(

@@ -133,6 +133,8 @@ class ConfirmedTuning:
             true = "ended early" if flight.true is None else f"{flight.true:.5g}"
             if flight.predicted is not None:
                 true += f", predicted {flight.predicted:.5g}"
+            if flight.violation is not None and flight.violation > FEASIBLE:
+                true += f", a limit passed by {flight.violation:.2%}"
             lines.append(f"  flight {k + 1}: {told}: {true}" + (" (best)" * (k == self.best)))
         return "\n".join(lines)
 
@@ -342,7 +344,8 @@ def _measured(task: TuningTask, k: int, run: Any) -> list[float]:
         )
     known = {c.name: c for c in (*s.observed, *s.controls, *s.outputs)}
     part = in_units_of(run.select(names), [known[n] for n in names]).window(begins, ends)
-    return [m.along(part.time, part[m.channel])[0] for m in task.problem.measures]
+    held = task.evaluator.held
+    return [m.along(part.time, part[m.channel], held(m.channel))[0] for m in task.problem.measures]
 
 
 def _flight(

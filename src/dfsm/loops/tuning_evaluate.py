@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +31,7 @@ from dfsm.simulation.closed_loop import (
     is_compiled,
     result_of,
 )
-from dfsm.simulation.loop import Drive, outside_along, roll_compiled
+from dfsm.simulation.loop import Drive, outside_along, roll, roll_compiled
 from dfsm.simulation.loop import Path as LoopPath
 from dfsm.simulation.loop_cases import (
     ClosedLoopSettings,
@@ -180,6 +182,23 @@ class Evaluator:
             found = replace(found, figures=before.figures)
         self._known[key] = found
 
+    def computed(self) -> tuple[Any, ...]:
+        """What is computed in a loop, step by step as JAX records it, and constants therein.
+
+        Numbers say too little of a controller: its delays and filters may be written into its code,
+        and a code that was edited is another controller of the same name.
+        """
+        recorded, *_ = eqx.filter_make_jaxpr(roll)(
+            self.model, self.wires, self._controller, self._drives[0]
+        )
+        # Where a function stood in memory says nothing of it.
+        return re.sub(r"0x[0-9a-f]+", "", str(recorded)), *_constants(recorded)
+
+    def held(self, channel: str) -> float:
+        """Seconds for which the controller holds a command; 0 for what it does not set."""
+        commanded = channel in self.tuned.controller.commands
+        return float(self.tuned.controller.interval) if commanded else 0.0
+
     def loops(self, theta: Array) -> list[ClosedLoopRun]:
         """The closed loops themselves at a point."""
         controller = self.tuned.at(theta)
@@ -227,12 +246,27 @@ class Evaluator:
             steps = np.asarray(moved)[:, : case.rows]
             ways = [case.sampled(way)[case.scored :] for way in steps]
         for m, measure in enumerate(self.measures):
-            figure, along = measure.along(run.time, run[measure.channel])
+            held = self.held(measure.channel)
+            figure, along = measure.along(run.time, run[measure.channel], held)
             figures.append(figure)
             if ways is not None:
                 column = shown.index(measure.channel)
                 slopes[m] = [along @ way[:, column] for way in ways]
         return figures, slopes
+
+
+def _constants(recorded: Any) -> Iterator[Any]:
+    """Arrays that code brought along, of functions within functions too; its text has scalars."""
+    yield from getattr(recorded, "consts", ())
+    for step in getattr(recorded, "jaxpr", recorded).eqns:
+        yield from (v.val for v in step.invars if np.ndim(getattr(v, "val", 0.0)))
+        for part in jax.tree.leaves(step.params, is_leaf=_is_recorded):
+            if _is_recorded(part):
+                yield from _constants(part)
+
+
+def _is_recorded(part: Any) -> bool:
+    return hasattr(part, "eqns") or hasattr(part, "consts")
 
 
 def _line(found: Figured) -> str:

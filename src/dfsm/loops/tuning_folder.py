@@ -122,9 +122,7 @@ def fingerprint(task: TuningTask) -> str:
     said: dict[str, Any] = {
         "dfsm": __version__,
         "runs": [run.digest for run in task.runs],
-        "controller": type(task.controller).__name__,
         "interval": float(task.controller.interval),
-        "measurements": dict(task.measurements or {}),
         "parameters": list(task.tuned.names),
         "measures": [
             [m.measure, m.channel, m.exponent, m.reference] for m in task.problem.measures
@@ -132,9 +130,11 @@ def fingerprint(task: TuningTask) -> str:
         "window": [settings.start, settings.stop, settings.loop.start_up, settings.loop.step],
     }
     h.update(json.dumps(json_value(said), sort_keys=True).encode())
-    for leaf in jax.tree.leaves((task.model, task.controller)):
+    for leaf in (*jax.tree.leaves((task.model, task.controller)), *task.evaluator.computed()):
         if hasattr(leaf, "dtype") or isinstance(leaf, int | float):
             h.update(np.asarray(leaf).tobytes())
+        elif isinstance(leaf, str):
+            h.update(leaf.encode())
     if task.discon is not None:
         h.update("".join(task.discon.lines).encode("utf-8", errors="surrogateescape"))
     return h.hexdigest()

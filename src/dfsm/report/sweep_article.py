@@ -87,7 +87,8 @@ def _extremes(lines: tuple[Swept, ...], swept: Sweep) -> Section:
         "Extrapolated largest values",
         ("controller", "channel", "value", "standard error", "blocks"),
         tuple(rows),
-        note="Gumbel's distribution of the maxima of blocks in every run, over all with weights.",
+        note="Gumbel's distribution of the maxima of blocks, of all runs of a condition together, "
+        "over all with weights.",
         digits=4,
     )
     return Section("extremes", "Extremes", tables=(table,))

@@ -29,6 +29,7 @@ from dfsm.errors import DfsmWarning, printable
 from dfsm.models.departures import MUCH_OUTSIDE, Departure, departures, told
 from dfsm.models.dfsm import DFSM
 from dfsm.models.staged import staged
+from dfsm.numerics.time_mesh import mean_over, weights_over_time
 from dfsm.simulation.drawn_run import DrawnRun
 from dfsm.simulation.loop import Drive, HostLoop, Path, outside_along, roll_compiled
 from dfsm.simulation.loop_cases import (
@@ -40,6 +41,7 @@ from dfsm.simulation.loop_cases import (
     prepared_cases,
 )
 from dfsm.simulation.outcome import ESCAPE
+from dfsm.simulation.own_loop import own_to_a_loop
 from dfsm.simulation.wires import Wires, connect, not_commanded
 
 # What is kept of a closed loop.
@@ -73,7 +75,7 @@ class ClosedLoopRun(DrawnRun):
     reason
         For a loop that did not complete, the signal and where; else "".
     outside
-        Share of the samples with any input of the model outside its training range; not a number
+        Share of the time with any input of the model outside its training range; not a number
         where nobody asked.
     departures
         Where it left the training range, those that lasted longest first.
@@ -149,7 +151,8 @@ def closed_loop(
         that the controller does not set.
     controller
         Steps at its interval and holds its commands in between. An equinox module is compiled with
-        the plant; any other `Controller`, a `BladedLibrary` say, is called on the host.
+        the plant; any other `Controller`, a `BladedLibrary` say, is called on the host. One that
+        can change is copied for every loop, so that nothing of one run enters another.
     start, stop
         Time window in s that is scored; None leaves that end open.
     measurements
@@ -313,7 +316,11 @@ def _roller(
         def gone(x: Array) -> bool:
             return not bool(((x >= low) & (x <= high)).all())
 
-        return lambda case, _: host.roll(controller, padded(case, len(case.drive.time) + 1), gone)
+        def stepped(case: LoopCase, _: Callable[[], Drive]) -> Path:
+            with own_to_a_loop(controller) as law:
+                return host.roll(law, padded(case, len(case.drive.time) + 1), gone)
+
+        return stepped
     numbers = as_arrays(controller)
 
     def compiled(_: LoopCase, padded_drive: Callable[[], Drive]) -> Path:
@@ -414,7 +421,8 @@ def _cut(
     part = Trajectory(
         run.time[kept], values[kept], tuple(channels), name=run.name, source=run.source
     )
-    return ClosedLoopRun(part, status, float(ended), reason, float(outside[kept].mean()))
+    share = float(mean_over(outside[kept], weights_over_time([part.time])))
+    return ClosedLoopRun(part, status, float(ended), reason, share)
 
 
 def _warn(results: Sequence[ClosedLoopRun]) -> None:

@@ -21,6 +21,7 @@ from dfsm.errors import hushed
 from dfsm.models.completion import all_completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.recorded import recorded_states
+from dfsm.numerics.time_mesh import weights_over_time
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, closed_loop
 from dfsm.simulation.loop_cases import ClosedLoopSettings, checked_loops
 from dfsm.simulation.simulate import Simulation, Status, simulate
@@ -253,7 +254,8 @@ def _compare(
 def _errors(ours: Trajectory | None, recorded: Trajectory) -> dict[str, ChannelError]:
     if ours is None:
         return {}
-    return {n: ChannelError.of(ours[n], recorded[n]) for n in ours.names}
+    weights = weights_over_time([ours.time])
+    return {n: ChannelError.of(ours[n], recorded[n], weights) for n in ours.names}
 
 
 def _ratio(ours: float, true: float) -> float:
