@@ -30,6 +30,8 @@ class Variable:
         Value reference.
     derivative_of
         Value reference of the state whose derivative it is.
+    moves
+        Whether it is an input that goes on between samples: an importer may set it within a step.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Variable:
     note: str
     reference: int
     derivative_of: int | None = None
+    moves: bool = False
 
 
 # Causality, variability and initial of every role.
@@ -81,7 +84,7 @@ def model_description(
         about["numberOfEventIndicators"] = "0"
     root = Element("fmiModelDescription", about)
     for kind in kinds:
-        _interface(root, name, fmi, kind)
+        _interface(root, name, fmi, kind, moving=any(v.moves for v in variables))
     units = ElementTree.SubElement(root, "UnitDefinitions")
     for unit in sorted({v.unit for v in variables if v.unit}):
         ElementTree.SubElement(units, "Unit", {"name": unit})
@@ -104,7 +107,7 @@ def build_description(name: str) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def _interface(root: Element, name: str, fmi: int, kind: str) -> None:
+def _interface(root: Element, name: str, fmi: int, kind: str, *, moving: bool) -> None:
     state = "FMUstate" if fmi == 2 else "FMUState"
     can = {"modelIdentifier": name, f"canGetAndSet{state}": "true"}
     can |= {f"canSerialize{state}": "true"}
@@ -113,6 +116,8 @@ def _interface(root: Element, name: str, fmi: int, kind: str) -> None:
         tag, can["canHandleVariableCommunicationStepSize"] = "CoSimulation", "true"
         if fmi == 2:
             can["canInterpolateInputs"] = "true"
+        elif moving:
+            can["providesIntermediateUpdate"] = "true"
     element = ElementTree.SubElement(root, tag, can)
     if fmi == 2:
         files = ElementTree.SubElement(element, "SourceFiles")
@@ -149,6 +154,8 @@ def _variable3(listed: Element, variable: Variable) -> None:
     told = _common(variable) | _numbers(variable)
     if variable.derivative_of is not None:
         told["derivative"] = str(variable.derivative_of)
+    if variable.moves:
+        told["intermediateUpdate"] = "true"
     ElementTree.SubElement(listed, "Float64", told)
 
 

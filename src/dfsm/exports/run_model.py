@@ -5,6 +5,7 @@
     model = Model("model.npz")
     model.derivative(states, controls, disturbances, parameters)    # per second
     model.output(states, controls, disturbances, parameters)
+    model.distance(states, controls, disturbances, parameters)    # more than 1: not in the data
     states, outputs = model.simulate(time, initial, controls, disturbances, parameters)
 
 Names, units and start values of all vectors, in order, stand in `model.description`.
@@ -142,6 +143,11 @@ class Model:
             return self.programs["g"](*vectors)
         turning = np.array([float(azimuth)]), np.asarray(field, dtype=float)
         return self.programs["g_at_azimuth"](*vectors, *turning)
+
+    def distance(self, states, controls, disturbances, parameters=()):
+        """How far a point is from the training data: up to 1 inside them."""
+        vectors = self._vectors((states, controls, disturbances, parameters))
+        return float(self.programs["d"](*vectors)[0])
 
     def simulate(
         self, time, initial, controls, disturbances, parameters=(), azimuth=None, field=None

@@ -90,10 +90,11 @@ API fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueRefer
   size_t i;
   SELF;
   for (i = 0; i < n; ++i) {
-    if (order[i] != 1 || r[i] < AT_INPUTS || r[i] >= AT_PARAMETERS || !isfinite(v[i])) {
-      return told(m, fmi2Error, "only first derivatives of inputs can be set");
+    if (order[i] < 1 || order[i] > 3 || r[i] < AT__INPUTS || r[i] >= AT__PARAMETERS
+        || !isfinite(v[i])) {
+      return told(m, fmi2Error, "first to third derivatives of inputs can be set");
     }
-    m->now.slope[r[i] - AT_INPUTS] = v[i];
+    m->now.slope[order[i] - 1][r[i] - AT__INPUTS] = v[i];
   }
   return fmi2OK;
 }
@@ -103,9 +104,7 @@ API fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueRefe
   return n ? told(m, fmi2Error, "derivatives of outputs are not provided") : fmi2OK;
 }
 API fmi2Status fmi2DoStep(fmi2Component c, double t, double h, fmi2Boolean noSetPrior) {
-  SELF; (void)noSetPrior;
-  return march(m, t, h) ? told(m, fmi2Error, "the step could not be made: a state is not finite")
-                        : fmi2OK;
+  SELF; (void)noSetPrior; ANSWER(march(m, t, h));
 }
 API fmi2Status fmi2CancelStep(fmi2Component c) { SELF; return fmi2Error; }
 API fmi2Status fmi2GetStatus(fmi2Component c, int k, fmi2Status *v) {
