@@ -207,9 +207,7 @@ def test_co_simulation_with_derivatives_of_the_inputs(kind, tmp_path):
 
     opened, refs = unpacked(kind, 2, tmp_path)
     slave: Any = FMU2Slave(**opened, instanceName="slave")
-    x, u, y = (
-        [refs[n] for n in names] for names in (NAMES, ("u0", "u1"), ("y0", "training_distance"))
-    )
+    x, u, y = ([refs[n] for n in names] for names in NAMES)
     slave.instantiate()
     ran(slave.setupExperiment)
     ran(slave.enterInitializationMode)
@@ -254,9 +252,7 @@ def test_co_simulation_with_inputs_set_within_steps(kind, tmp_path):
     slave.instantiate(
         intermediateUpdate=update, requiredIntermediateVariables=[refs[n] for n in moving]
     )
-    x, u, y = (
-        [refs[n] for n in names] for names in (NAMES, ("u0", "u1"), ("y0", "training_distance"))
-    )
+    x, u, y = ([refs[n] for n in names] for names in NAMES)
     ran(slave.enterInitializationMode)
     ran(slave.setFloat64, x, START)
     ran(slave.exitInitializationMode)
