@@ -77,6 +77,22 @@ def test_a_computed_input_is_told_beside_its_variable_whatever_its_name(tmp_path
     assert way.get("providesIntermediateUpdate") == "true"
 
 
+def test_names_that_xml_cannot_hold_are_told_without_them(tmp_path: Path):
+    names = ["bell\x07 <b>", "new\nline", "der(x)", "x", "training_distance", "time", " "]
+    model = linear_model(-np.eye(7), np.ones((7, 1)), names=names, units=["m\x00s"] * 7)
+    made = write_fmu(model, tmp_path / "m.fmu", fmi=2)
+    with zipfile.ZipFile(made.path) as archive:
+        root = ElementTree.fromstring(archive.read("modelDescription.xml"))
+    told = [v.get("name") for v in root.iter("ScalarVariable")]
+    assert len(set(told)) == len(told)
+    assert told[1:8] == [
+        *("bell <b>", "new line", "der(x)", "x", "training_distance", "time_2", "unnamed"),
+    ]
+    assert told[11:13] == ["der(x)_2", "der(training_distance)"]
+    assert told[-1] == "training_distance_2"
+    assert {u.get("name") for u in root.iter("Unit")} >= {"m s", "m s/s"}
+
+
 def test_an_fmu_takes_the_step_that_its_model_was_made_for(tmp_path: Path):
     model = hidden("polynomial")
     model = replace(model, signals=replace(model.signals, step=0.25))

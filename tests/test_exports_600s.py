@@ -118,6 +118,8 @@ def test_numpy_alone(kind, tmp_path, monkeypatch):
     k = int(np.argmax(distances))
     told = light.distance(states[k], inputs()[k, :1], inputs()[k, 1:])
     assert told == pytest.approx(distances[k], rel=1e-12)
+    with pytest.raises(ValueError, match="times go back"):
+        light.simulate(TIME[::-1], START, inputs()[:, :1], inputs()[:, 1:])
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -56,6 +56,10 @@ def test_files_hold_matrices_points_names_and_units(models, tmp_path):
     assert [str(c[0][0]) for c in mat["state_names"]] == ["q", "v"]
     assert [str(c[0][0]) for c in mat["input_units"]] == ["N", "m/s"]
     np.testing.assert_array_equal(mat["schedule"], [[7.0, 8.0]])
+    region = fits.scheduled().region
+    ends = np.stack([region.low, region.high], axis=1)[[2, 3, 0, 1]]  # states before inputs
+    np.testing.assert_array_equal(np.vstack([mat["state_ranges"], mat["input_ranges"]]), ends)
+    assert [c["trained"] for c in (*told["states"], *told["inputs"])] == ends.tolist()
     assert [i["role"] for i in told["inputs"]] == ["control", "disturbance"]
     assert told["schedule"]["name"] == "w"
     with pytest.raises(DfsmError, match=r"the suffix '.csv', expected .mat or .json"):

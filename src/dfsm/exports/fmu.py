@@ -24,7 +24,7 @@ from dfsm.core.settings import require
 from dfsm.errors import DfsmError
 from dfsm.exports.c_code import CSource, to_c
 from dfsm.exports.fmu_description import Variable, build_description, model_description
-from dfsm.exports.identifiers import numbers
+from dfsm.exports.identifiers import numbers, one_line
 from dfsm.models.dfsm import DFSM
 
 Kind = Literal["model-exchange", "co-simulation"]
@@ -148,10 +148,11 @@ def _safe_step(model: DFSM, longest: float | None) -> float:
 def _variables(code: CSource, step: float) -> tuple[Variable, ...]:
     """All variables in the order of their value references."""
     told, turn = code.description, code.description.get("azimuth")
+    rows: list[tuple[str, str, float | None, str, str, bool]]
     rows = [("time", "s", 0.0, "independent", "", False)]
-    latent = set(told["latent_states"])
+    latent = f"latent state, start value: {told['latent_starts']}"
     for e in told["states"]:
-        note = "latent state" if e["name"] in latent else "state"
+        note = latent if e["name"] in told["latent_states"] else "state"
         rows.append((e["name"], e["unit"], e["start"], "state", _said(note, e), False))
     if turn is not None:
         rows.append(("azimuth", "rad", 0.0, "state", "state: the azimuth of the rotor", False))
@@ -171,13 +172,15 @@ def _variables(code: CSource, step: float) -> tuple[Variable, ...]:
     rows.append((_DISTANCE[0], "", None, "output", _DISTANCE[1], False))
     variables, taken = list[Variable](), set[str]()
     for reference, (name, unit, start, role, note, moves) in enumerate(rows):
-        plain, count = " ".join(name.split()) or "unnamed", 1
+        plain = wanted = one_line(name) or "unnamed"
+        count = 1
         while plain in taken:
             count += 1
-            plain = f"{' '.join(name.split())}_{count}"
+            plain = f"{wanted}_{count}"
         taken.add(plain)
         of = reference - len(states) if role == "derivative" else None
-        variables.append(Variable(plain, unit, start, role, note, reference, of, moves))
+        shown = (start, role, one_line(note), reference, of, moves)
+        variables.append(Variable(plain, one_line(unit), *shown))
     return tuple(variables)
 
 

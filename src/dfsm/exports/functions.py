@@ -134,9 +134,10 @@ def description(model: DFSM) -> dict[str, Any]:
             entry["computed"] = computed[entry["name"]]
     told["computed_inputs"] = list(computed.values())
     told["notes"] = [*told["computed_inputs"]]
-    if s.startup:
+    if s.latents:
         names = ", ".join(told["latent_states"])
-        told["notes"].append(f"{names}, which nobody measures, start at {told['latent_starts']}")
+        starts = f"{'at ' if s.startup else ''}{told['latent_starts']}"
+        told["notes"].append(f"{names}, which nobody measures, start {starts}")
     rate = s.azimuth_rate
     if rate is not None:
         told["azimuth"] = {"unit": "rad", "speed": s.states[rate[0]].name, "rad/s": rate[1]}
