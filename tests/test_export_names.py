@@ -54,6 +54,13 @@ def test_an_fmu_of_any_name_is_compiled(name, fmi, tmp_path):
     # Of these the functions of FMI have constants of their own.
     made = write_fmu(whole() if fmi == 3 else hidden("tanh"), tmp_path / f"{name}.fmu", fmi=fmi)
     assert made.binary is not None
+    with zipfile.ZipFile(made.path) as archive:
+        archive.extractall(tmp_path)
+    command = [*STRICT, "-fsyntax-only", "fmu.c", f"{name}.c"]
+    done = subprocess.run(
+        command, cwd=tmp_path / "sources", capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_computed_input_is_told_beside_its_variable_whatever_its_name(tmp_path: Path):
@@ -75,6 +82,12 @@ def test_a_computed_input_is_told_beside_its_variable_whatever_its_name(tmp_path
     assert moving == [None, "true"]
     (way,) = root.iter("CoSimulation")
     assert way.get("providesIntermediateUpdate") == "true"
+
+
+def test_only_co_simulation_has_steps_to_set_inputs_within(tmp_path: Path):
+    made = write_fmu(hidden("tanh"), tmp_path / "m.fmu", kind="model-exchange")
+    with zipfile.ZipFile(made.path) as archive:
+        assert b"ntermediateUpdate" not in archive.read("modelDescription.xml")
 
 
 def test_names_that_xml_cannot_hold_are_told_without_them(tmp_path: Path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from xml.etree import ElementTree
 
 from dfsm.core.version import __version__
@@ -73,6 +73,8 @@ def model_description(
     variables
         In the order of their value references.
     """
+    if "co-simulation" not in kinds:  # nobody else has steps to set inputs within
+        variables = [replace(v, moves=False) for v in variables]
     about = {
         "fmiVersion": f"{fmi}.0",
         "modelName": name,

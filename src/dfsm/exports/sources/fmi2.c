@@ -43,7 +43,7 @@ API fmi2Component fmi2Instantiate(const char *name, int type, const char *guid,
   if (!guid || strcmp(guid, MODEL_TOKEN)) return NULL;
   m = instance_new(name);
   if (m && callbacks) {
-    m->logger = (void *)callbacks->logger;
+    m->logger = (Function)callbacks->logger;
     m->environment = callbacks->environment;
     m->logging = logging;
   }

@@ -29,7 +29,7 @@ static fmi3Instance made(const char *name, const char *token, bool logging, void
   if (m) {
     m->logging = logging;
     m->environment = environment;
-    m->logger = (void *)logger;
+    m->logger = (Function)logger;
   }
   return m;
 }
@@ -58,7 +58,7 @@ API fmi3Instance fmi3InstantiateCoSimulation(const char *name, const char *token
   (void)resources; (void)visible; (void)eventMode; (void)earlyReturn; (void)required;
   if (m && update && n) {
     m->ask = asked;
-    m->update = (void *)update;
+    m->update = (Function)update;
   }
   return m;
 }

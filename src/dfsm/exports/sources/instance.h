@@ -43,14 +43,16 @@ typedef struct {
 /* Asks the importer for inputs at a time within a step; 0 where it was asked in vain. FMI 3 only. */
 typedef struct Instance Instance;
 typedef int (*Asker)(Instance *, double);
+/* Any function of the importer; it is called as what it is. */
+typedef void (*Function)(void);
 
 struct Instance {
   State now;
   char name[256];
   void *environment;
-  void *logger;
+  Function logger;
   Asker ask;
-  void *update; /* what `ask` calls */
+  Function update; /* what `ask` calls */
   int within; /* whether a step is being made: only inputs that are not held can be set */
   int refused; /* whether something could not be set */
   int logging;
