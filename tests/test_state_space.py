@@ -81,6 +81,19 @@ def test_systems_of_python_control_answer_as_the_model_does():
     assert np.abs(np.atleast_2d(answer)).max() > 1e-3
 
 
+def test_names_with_dots_and_a_system_that_python_control_does_not_hold():
+    control = pytest.importorskip("control")
+    model = linear_model(A, B, C, names=["a.b", "a_b"])
+    (system,) = package.to_state_space(model).control()
+    assert system.state_labels == ["a_b_", "a_b"]
+    alone = model.linearize([0.0, 0.0], [0.0, 0.0], [])
+    assert alone.state_labels == ["a_b_", "a_b"]
+    assert np.atleast_2d(control.step_response(alone, [0, 1]).outputs).shape[-1] == 2
+    decay = linear_model(np.array([[-1.0]]), np.zeros((1, 0)))
+    with pytest.raises(DfsmError, match="one state and neither controls nor disturbances"):
+        package.to_state_space(decay).control()
+
+
 def test_a_point_without_a_steady_state_is_told_and_linearized_all_the_same():
     drifting = linear_model(np.array([[0.0, 1.0], [0.0, 0.0]]), B, C, names=["q", "v"])
     with pytest.warns(package.DfsmWarning, match="no steady state: linearized at the mean of"):

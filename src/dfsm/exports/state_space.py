@@ -16,6 +16,7 @@ from dfsm.core.types import Array
 from dfsm.core.version import __version__
 from dfsm.data.channel import Channel
 from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.models.control_system import control_system
 from dfsm.models.dfsm import DFSM
 from dfsm.models.steady import operating_point, steady_state
 
@@ -119,20 +120,11 @@ class StateSpaceModels(Sequence[Linearization]):
         Raises
         ------
         DfsmError
-            python-control is not installed.
+            python-control is not installed, or holds no such system, see `control_system`.
         """
-        try:
-            import control
-        except ImportError:
-            raise DfsmError(
-                "state-space systems need python-control: pip install 'dfsm[control]'"
-            ) from None
-        names = {
-            "states": [c.name for c in self.states],
-            "inputs": [c.name for c in self.inputs],
-            "outputs": [c.name for c in self.outputs],
-        }
-        return [control.StateSpace(p.A, p.B, p.C, p.D, **names) for p in self.points]
+        groups = (self.states, self.inputs, self.outputs)
+        names = [[c.name for c in group] for group in groups]
+        return [control_system((p.A, p.B, p.C, p.D), *names) for p in self.points]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values: matrices, points, names and units."""

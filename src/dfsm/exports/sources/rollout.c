@@ -40,8 +40,8 @@ int NAME_step(double seconds, const double *states,
 
 /* An input at a sample, by its place among controls and disturbances. */
 static double NAME_sample(const double *controls, const double *disturbances, int k, int i) {
-  return i < UPPER_CONTROLS ? controls[k * UPPER_CONTROLS + i]
-                            : disturbances[k * UPPER_DISTURBANCES + i - UPPER_CONTROLS];
+  return i < UPPER_CONTROLS ? controls[(size_t)k * UPPER_CONTROLS + i]
+                            : disturbances[(size_t)k * UPPER_DISTURBANCES + i - UPPER_CONTROLS];
 }
 
 /* Slopes of a spline through v at n times: no knots at the second and at the last but one. */
