@@ -300,6 +300,28 @@ def test_an_input_that_is_held_cannot_be_set_within_a_step(tmp_path):
 
 
 @needs_compiler
+def test_leaving_the_training_data_is_logged_once(tmp_path):
+    pytest.importorskip("fmpy")
+    from fmpy.fmi3 import FMU3Slave
+
+    opened, refs = unpacked("tanh", 3, tmp_path)
+    logged = []
+    for logs in (True, False):
+        slave: Any = FMU3Slave(**opened, instanceName="slave")
+        slave.instantiate(loggingOn=logs, logMessage=lambda *told: logged.append(told[1:]))
+        ran(slave.enterInitializationMode)
+        ran(slave.exitInitializationMode)
+        for k in range(4):
+            ran(slave.setFloat64, [refs["u0"]], [9.0 if k < 2 else 11.0])
+            assert (slave.getFloat64([refs["training_distance"]])[0] > 1) == (k >= 2)
+            slave.doStep(0.2 * k, 0.2)
+        slave.freeInstance()
+    ((status, category, text),) = logged
+    assert (status, category) == (1, b"logStatusWarning")
+    assert text == b"the training data are left: training_distance, an output, is above 1"
+
+
+@needs_compiler
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_model_exchange(fmi, tmp_path):
     pytest.importorskip("fmpy")

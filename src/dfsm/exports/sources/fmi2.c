@@ -27,7 +27,7 @@ typedef char Byte;
 
 static fmi2Status told(Instance *m, fmi2Status status, const char *text) {
   if (status != fmi2OK && m->logger) {
-    ((fmi2Logger)m->logger)(m->environment, m->name, status, "logStatusError", text);
+    ((fmi2Logger)m->logger)(m->environment, m->name, status, status == fmi2Warning ? "logStatusWarning" : "logStatusError", text);
   }
   return status;
 }
@@ -104,7 +104,12 @@ API fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueRefe
   return n ? told(m, fmi2Error, "derivatives of outputs are not provided") : fmi2OK;
 }
 API fmi2Status fmi2DoStep(fmi2Component c, double t, double h, fmi2Boolean noSetPrior) {
-  SELF; (void)noSetPrior; ANSWER(march(m, t, h));
+  const char *problem;
+  SELF;
+  (void)noSetPrior;
+  problem = march(m, t, h);
+  if (!problem && strays(m)) told(m, fmi2Warning, STRAYED);
+  return problem ? told(m, fmi2Error, problem) : fmi2OK;
 }
 API fmi2Status fmi2CancelStep(fmi2Component c) { SELF; return fmi2Error; }
 API fmi2Status fmi2GetStatus(fmi2Component c, int k, fmi2Status *v) {

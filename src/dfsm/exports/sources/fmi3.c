@@ -17,7 +17,7 @@ typedef uint8_t Byte;
 
 static fmi3Status told(Instance *m, fmi3Status status, const char *text) {
   if (status != fmi3OK && m->logger) {
-    ((fmi3Logger)m->logger)(m->environment, status, "logStatusError", text);
+    ((fmi3Logger)m->logger)(m->environment, status, status == fmi3Warning ? "logStatusWarning" : "logStatusError", text);
   }
   return status;
 }
@@ -190,6 +190,7 @@ API fmi3Status fmi3DoStep(fmi3Instance c, double t, double h, bool noSetPrior, b
   *event = *terminate = *early = false;
   text = march(m, t, h);
   *last = m->now.value[0];
+  if (!text && strays(m)) told(m, fmi3Warning, STRAYED);
   return text ? told(m, fmi3Error, text) : fmi3OK;
 }
 API fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference r, double t) {

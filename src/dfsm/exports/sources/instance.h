@@ -14,6 +14,8 @@
 #define API __attribute__((visibility("default")))
 #endif
 
+#define STRAYED "the training data are left: training_distance, an output, is above 1"
+
 /* A version of FMI defines FMI(name), which puts its prefix before a name, and told(), which hands
    an error on. The first word of every function, and its last one: a problem in words, or NULL. */
 #define SELF Instance *m = (Instance *)c; if (!m) return FMI(Error)
@@ -56,12 +58,14 @@ struct Instance {
   int within; /* whether a step is being made: only inputs that are not held can be set */
   int refused; /* whether something could not be set */
   int logging;
+  int strayed; /* whether it was told that the training data were left */
 };
 
 static void instance_reset(Instance *m) {
   memset(&m->now, 0, sizeof m->now);
   memcpy(m->now.value, start_values, sizeof m->now.value);
   m->now.stale = 1;
+  m->strayed = 0;
 }
 
 static Instance *instance_new(const char *name) {
@@ -124,6 +128,14 @@ static int set_value(Instance *m, unsigned int reference, double value) {
   m->now.value[reference] = value;
   m->now.stale = 1;
   return 0;
+}
+
+/* Whether the training data were left, which is asked where somebody reads logs, and told once. */
+static int strays(Instance *m) {
+  double distance;
+  if (!m->logging || m->strayed || get_value(m, AT__DISTANCE, &distance)) return 0;
+  m->strayed = distance > 1.0 + 1e-6;
+  return m->strayed;
 }
 
 static const char *values_got(Instance *m, const unsigned int r[], size_t n, double v[]) {
