@@ -111,3 +111,8 @@ def test_an_fmu_takes_the_step_that_its_model_was_made_for(tmp_path: Path):
     model = replace(model, signals=replace(model.signals, step=0.25))
     made = write_fmu(model, tmp_path / "m.fmu")
     assert next(v.start for v in made.variables if v.name == "rk4_step") == pytest.approx(0.25)
+    # Whoever asks for nothing holds inputs no longer than that.
+    with zipfile.ZipFile(made.path) as archive:
+        root = ElementTree.fromstring(archive.read("modelDescription.xml"))
+    (experiment,) = root.iter("DefaultExperiment")
+    assert float(experiment.get("stepSize", "")) == pytest.approx(0.25)

@@ -178,7 +178,7 @@ def _arrays(name: str, told: dict[str, Any]) -> str:
         parts.append(numbers(f"{name}_{g}_starts", [e["start"] for e in told[g]]))
         for k, end in enumerate(("low", "high")):
             parts.append(numbers(f"{name}_{g}_{end}", [e["trained"][k] for e in told[g]]))
-    parts.append(f"const double {name}_longest_step = {told['step'] or 0.0!r};\n")
+    parts.append(f"const double {name}_longest_step = {float(told['step'] or 0.0)!r};\n")
     kinds = [e["between_samples"] for g in ("controls", "disturbances") for e in told[g]]
     places = ", ".join(str(_BETWEEN.index(kind)) for kind in kinds) or "0"
     parts.append(f"static const int {name}_between[] = {{{places}}};\n")

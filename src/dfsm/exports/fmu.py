@@ -118,7 +118,7 @@ def write_fmu(
     source = _source(model, code, variables, fmi)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_OID, code.source + source + str((fmi, kinds)))}}}"
     source = source.replace("THE_TOKEN", token)
-    description = model_description(code.name, token, fmi, kinds, variables)
+    description = model_description(code.name, token, fmi, kinds, variables, step)
     files: dict[str, bytes] = {
         "modelDescription.xml": description,
         f"sources/{code.name}.c": code.source.encode(),

@@ -56,7 +56,12 @@ _ROLES = {
 
 
 def model_description(
-    name: str, token: str, fmi: int, kinds: Sequence[str], variables: Sequence[Variable]
+    name: str,
+    token: str,
+    fmi: int,
+    kinds: Sequence[str],
+    variables: Sequence[Variable],
+    step: float,
 ) -> bytes:
     """The XML of an FMU.
 
@@ -72,6 +77,8 @@ def model_description(
         Interfaces that it has.
     variables
         In the order of their value references.
+    step
+        Communication step in s that an importer is to take unless it is told another.
     """
     if "co-simulation" not in kinds:  # nobody else has steps to set inputs within
         variables = [replace(v, moves=False) for v in variables]
@@ -90,7 +97,7 @@ def model_description(
     units = ElementTree.SubElement(root, "UnitDefinitions")
     for unit in sorted({v.unit for v in variables if v.unit}):
         ElementTree.SubElement(units, "Unit", {"name": unit})
-    ElementTree.SubElement(root, "DefaultExperiment", {"startTime": "0"})
+    ElementTree.SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(float(step))})
     listed = ElementTree.SubElement(root, "ModelVariables")
     for variable in variables:
         (_variable2 if fmi == 2 else _variable3)(listed, variable)
