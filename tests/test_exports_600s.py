@@ -300,6 +300,27 @@ def test_an_input_that_is_held_cannot_be_set_within_a_step(tmp_path):
 
 
 @needs_compiler
+def test_what_cannot_be_set_is_told(tmp_path):
+    pytest.importorskip("fmpy")
+    from fmpy.fmi3 import FMU3Slave
+
+    opened, refs = unpacked("tanh", 3, tmp_path)
+    slave: Any = FMU3Slave(**opened, instanceName="slave")
+    logged = []
+    slave.instantiate(logMessage=lambda *told: logged.append(told[3].decode()))
+    for reference, value, sentence in (
+        (999, 1.0, "there is no variable of this value reference"),
+        (refs["der(y)"], 1.0, "time, derivatives and outputs are computed"),
+        (refs["u0"], np.inf, "a value to set is not finite"),
+        (refs["rk4_step"], 0.0, "rk4_step must be above 0 s"),
+    ):
+        with pytest.raises(Exception, match="fmi3SetFloat64"):
+            slave.setFloat64([reference], [value])
+        assert logged[-1].startswith(sentence)
+    slave.freeInstance()
+
+
+@needs_compiler
 def test_leaving_the_training_data_is_logged_once(tmp_path):
     pytest.importorskip("fmpy")
     from fmpy.fmi3 import FMU3Slave

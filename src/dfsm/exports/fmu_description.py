@@ -97,7 +97,9 @@ def model_description(
     units = ElementTree.SubElement(root, "UnitDefinitions")
     for unit in sorted({v.unit for v in variables if v.unit}):
         ElementTree.SubElement(units, "Unit", {"name": unit})
-    ElementTree.SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(float(step))})
+    ElementTree.SubElement(
+        root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(float(step))}
+    )
     listed = ElementTree.SubElement(root, "ModelVariables")
     for variable in variables:
         (_variable2 if fmi == 2 else _variable3)(listed, variable)

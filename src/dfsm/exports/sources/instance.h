@@ -115,19 +115,30 @@ static int get_value(Instance *m, unsigned int reference, double *value) {
   return 0;
 }
 
-/* Whether it cannot be set; a step in which that happens is not made. */
-static int set_value(Instance *m, unsigned int reference, double value) {
-  int settable = (reference >= AT__STATES && reference < AT__RATES)
-      || (reference >= AT__INPUTS && reference < AT__OUTPUTS);
-  if (m->within) settable = settable && reference < AT__PARAMETERS && reference >= AT__INPUTS
-      && moves_within[reference - AT__INPUTS];
-  if (!settable || !isfinite(value) || (reference == AT__STEP && value <= 0.0)) {
-    m->refused = 1;
-    return 1;
+/* Why it cannot be set, or NULL; a step in which that happens is not made. */
+static const char *set_value(Instance *m, unsigned int reference, double value) {
+  const int is_state = reference >= AT__STATES && reference < AT__RATES;
+  const int is_input = reference >= AT__INPUTS && reference < AT__PARAMETERS;
+  const int is_parameter = reference >= AT__PARAMETERS && reference < AT__OUTPUTS;
+  const char *problem = NULL;
+  if (reference >= COUNT__ALL) {
+    problem = "there is no variable of this value reference";
+  } else if (!is_state && !is_input && !is_parameter) {
+    problem = "time, derivatives and outputs are computed: only states, inputs and parameters can be set";
+  } else if (m->within && !(is_input && moves_within[reference - AT__INPUTS])) {
+    problem = "within a step only inputs can be set that are not held between samples";
+  } else if (!isfinite(value)) {
+    problem = "a value to set is not finite";
+  } else if (reference == AT__STEP && value <= 0.0) {
+    problem = "rk4_step must be above 0 s";
   }
-  m->now.value[reference] = value;
-  m->now.stale = 1;
-  return 0;
+  if (problem) {
+    m->refused = 1;
+  } else {
+    m->now.value[reference] = value;
+    m->now.stale = 1;
+  }
+  return problem;
 }
 
 /* Whether the training data were left, which is asked where somebody reads logs, and told once. */
@@ -141,7 +152,7 @@ static int strays(Instance *m) {
 static const char *values_got(Instance *m, const unsigned int r[], size_t n, double v[]) {
   size_t i;
   for (i = 0; i < n; ++i) {
-    if (get_value(m, r[i], &v[i])) return "there is no such variable";
+    if (get_value(m, r[i], &v[i])) return "there is no variable of this value reference";
   }
   return NULL;
 }
@@ -149,7 +160,8 @@ static const char *values_got(Instance *m, const unsigned int r[], size_t n, dou
 static const char *values_set(Instance *m, const unsigned int r[], size_t n, const double v[]) {
   size_t i;
   for (i = 0; i < n; ++i) {
-    if (set_value(m, r[i], v[i])) return "this variable cannot have this value";
+    const char *problem = set_value(m, r[i], v[i]);
+    if (problem) return problem;
   }
   return NULL;
 }
