@@ -27,7 +27,8 @@ typedef char Byte;
 
 static fmi2Status told(Instance *m, fmi2Status status, const char *text) {
   if (status != fmi2OK && m->logger) {
-    ((fmi2Logger)m->logger)(m->environment, m->name, status, status == fmi2Warning ? "logStatusWarning" : "logStatusError", text);
+    const char *kind = status == fmi2Warning ? "logStatusWarning" : "logStatusError";
+    ((fmi2Logger)m->logger)(m->environment, m->name, status, kind, text);
   }
   return status;
 }

@@ -17,7 +17,8 @@ typedef uint8_t Byte;
 
 static fmi3Status told(Instance *m, fmi3Status status, const char *text) {
   if (status != fmi3OK && m->logger) {
-    ((fmi3Logger)m->logger)(m->environment, status, status == fmi3Warning ? "logStatusWarning" : "logStatusError", text);
+    const char *kind = status == fmi3Warning ? "logStatusWarning" : "logStatusError";
+    ((fmi3Logger)m->logger)(m->environment, status, kind, text);
   }
   return status;
 }

@@ -42,7 +42,7 @@ typedef struct {
   int stale; /* whether derivatives and outputs are to be computed */
 } State;
 
-/* Asks the importer for inputs at a time within a step; 0 where it was asked in vain. FMI 3 only. */
+/* Asks the importer for inputs at a time within a step; 0 where that was in vain. FMI 3 only. */
 typedef struct Instance Instance;
 typedef int (*Asker)(Instance *, double);
 /* Any function of the importer; it is called as what it is. */
@@ -124,7 +124,8 @@ static const char *set_value(Instance *m, unsigned int reference, double value) 
   if (reference >= COUNT__ALL) {
     problem = "there is no variable of this value reference";
   } else if (!is_state && !is_input && !is_parameter) {
-    problem = "time, derivatives and outputs are computed: only states, inputs and parameters can be set";
+    problem = "time, derivatives and outputs are computed: only states, inputs and parameters can "
+        "be set";
   } else if (m->within && !(is_input && moves_within[reference - AT__INPUTS])) {
     problem = "within a step only inputs can be set that are not held between samples";
   } else if (!isfinite(value)) {

@@ -119,7 +119,8 @@ int NAME_simulate(int samples, const double *time, const double *controls,
           if (NAME_between[i] == 1) inputs[s][i] = begin + t * rise;
           if (NAME_between[i] == 2) {
             const double bend = (3.0 * rise - 2.0 * m[0] - m[1]) / h;
-            inputs[s][i] = begin + t * (m[0] + t * (bend + t * (m[0] + m[1] - 2.0 * rise) / (h * h)));
+            const double twist = (m[0] + m[1] - 2.0 * rise) / (h * h);
+            inputs[s][i] = begin + t * (m[0] + t * (bend + t * twist));
           }
         }
       }
