@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import jax.numpy as jnp
@@ -12,17 +13,23 @@ from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.features import Feature, with_features
 from dfsm.data.readers.rotor_table import RotorTable
 from dfsm.data.trajectory import Channel, Trajectory
-from dfsm.models.corrective import GaussianUnits, Perceptron
+from dfsm.models.corrective import GaussianUnits, Perceptron, Polynomial
+from dfsm.models.corrective.polynomial import monomials
 from dfsm.models.dfsm import DFSM
 from dfsm.models.linear import LinearModel
 from dfsm.models.passing import Passing
 from dfsm.models.region import Region
 from dfsm.models.signals import Azimuth, SignalTable
 from dfsm.models.terms import Function, Product, QuadraticDrag, Rotor, Terms
+from systems import linear_model
 
 RINGS = (20.0, 40.0)
 AZIMUTH = Azimuth(speed="RotSpeed", angle="Azimuth", rings=RINGS, orders={1: (0, 1), 3: (2, 3)})
 TABLE = jnp.array([0.0, 1.0, 4.0, 9.0, 16.0])
+
+
+A = np.array([[-0.4, 1.0, 0.2], [-0.8, -0.5, 0.3], [0.1, -0.2, -0.7]])
+B = np.array([[0.3, 0.1], [0.5, -0.2], [0.0, 0.4]])
 
 
 def friction(speed, heave):
@@ -136,6 +143,33 @@ def whole() -> DFSM:
             jnp.asarray(rng.normal(size=(3, 3, 20))), jnp.asarray(8.0), jnp.array([6.0, 16.0]), 4
         ),
     )
+
+
+def hidden(kind: str) -> DFSM:
+    """One measured and two hidden states, all rows corrected, made for steps of half a sample."""
+    rng = np.random.default_rng(7)
+    model = linear_model(A, B, np.array([[2.0, 0.0, 0.0]]), names=["y", "hidden1", "hidden2"])
+    signals = replace(
+        model.signals,
+        specs=model.signals.specs[:1],
+        latents=model.signals.states[1:],
+        between=("hold", "cubic"),
+        startup=5.0,
+        step=0.1,
+    )
+    shift, scale = jnp.asarray(rng.normal(size=5)), jnp.asarray(rng.uniform(1, 2, 5))
+    factors = monomials(5, 3)
+    e = (
+        Polynomial(shift, scale, jnp.asarray(0.02 * rng.normal(size=(3, len(factors)))), factors)
+        if kind == "polynomial"
+        else Perceptron(
+            shift,
+            scale,
+            (jnp.asarray(rng.normal(size=(6, 5))), jnp.asarray(0.05 * rng.normal(size=(3, 6)))),
+            (jnp.asarray(rng.normal(size=6)), jnp.zeros(3)),
+        )
+    )
+    return replace(model, e=e, corrected=(0, 1, 2), signals=signals)
 
 
 def points(model: DFSM, count: int = 1000) -> list[Array]:

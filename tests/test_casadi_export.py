@@ -17,7 +17,7 @@ import dfsm
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.exports.casadi_model import to_function
-from dfsm.exports.translate import translated
+from dfsm.exports.translate import UntranslatableError, translated
 from dfsm.models.model_folder import save
 from dfsm.models.signals import Azimuth
 from dfsm.models.terms import Function, Terms
@@ -206,14 +206,43 @@ def _products(x):
     return jnp.concatenate([*sums, jnp.einsum("ijk,ilk->ijl", A, A).ravel(), (x @ TABLE) * x.any()])
 
 
+def _running(x):
+    A = jnp.outer(x, jnp.array([1.0, -2.0, 0.5]))
+    both = [jnp.cumsum(A, axis=1), jnp.cumprod(A, axis=0), jax.lax.cummax(A, reverse=True)]
+    places = jnp.stack([jnp.argmax(x), jnp.argmin(A[0])]) + jnp.argmax(A, axis=1)[:2]
+    return jnp.concatenate([jnp.stack(both).ravel(), places, jnp.tile(x, 2)])
+
+
+def _by_cases(x):
+    cases = [jnp.select([x < -1, x < 1], [x, x**2], x**3)]
+    cases += [jnp.piecewise(x, [x < 0, x > 1], [jnp.sin, jnp.cos, lambda v: v])]
+    cases += [jnp.where((x > 0) ^ (x > 1), x, 0.0), jnp.where(jnp.isfinite(1 / x), x, 9.0)]
+    return jnp.concatenate([*cases, jax.nn.logsumexp(x)[None], (3e9 * x).astype(jnp.int32)])
+
+
 @pytest.mark.parametrize(
-    "function", [_loop, _moved, _looked_up, _chosen, _elementary, _complex, _products]
+    "function",
+    [_loop, _moved, _looked_up, _chosen, _elementary, _complex, _products, _running, _by_cases],
 )
 def test_a_users_function_means_what_jax_means(function):
     inputs = np.random.default_rng(4).normal(size=(40, 3)) * 1.7
     program = to_function(translated(function, [("x", 3)]), "g")
     ours = np.array(program.map(40)(inputs.T)).T
     close(ours, np.asarray(jax.jit(jax.vmap(function))(jnp.asarray(inputs))), 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("function", "named"),
+    [
+        (lambda x: (x.astype(int) & 6) * 1.0, "and of the bits of whole numbers"),
+        (lambda x: ~x.astype(int) * 1.0, "not of the bits of whole numbers"),
+        (lambda x: (x * 100).astype(jnp.uint8) * 1.0, "whole numbers that end at 255"),
+    ],
+)
+def test_whole_numbers_of_bits_are_refused(function, named):
+    # Truths and fractions in their place would be other numbers without a word.
+    with pytest.raises(UntranslatableError, match=named):
+        translated(function, [("x", 2)])
 
 
 def test_a_table_that_is_looked_up_beyond_its_ends():

@@ -6,7 +6,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,42 +17,10 @@ from dfsm.exports.fmu import write_fmu
 from dfsm.exports.functions import description
 from dfsm.exports.python_model import write_python
 from dfsm.exports.state_space import to_state_space
-from dfsm.models.corrective import Perceptron, Polynomial
-from dfsm.models.corrective.polynomial import monomials
-from dfsm.models.dfsm import DFSM
-from exported import close, points
+from exported import close, hidden, points
 from systems import linear_model
 
-A = np.array([[-0.4, 1.0, 0.2], [-0.8, -0.5, 0.3], [0.1, -0.2, -0.7]])
-B = np.array([[0.3, 0.1], [0.5, -0.2], [0.0, 0.4]])
 TIME = np.arange(0, 60, 0.2)
-
-
-def hidden(kind: str) -> DFSM:
-    """One measured and two hidden states, all rows corrected, made for steps of half a sample."""
-    rng = np.random.default_rng(7)
-    model = linear_model(A, B, np.array([[2.0, 0.0, 0.0]]), names=["y", "hidden1", "hidden2"])
-    signals = replace(
-        model.signals,
-        specs=model.signals.specs[:1],
-        latents=model.signals.states[1:],
-        between=("hold", "cubic"),
-        startup=5.0,
-        step=0.1,
-    )
-    shift, scale = jnp.asarray(rng.normal(size=5)), jnp.asarray(rng.uniform(1, 2, 5))
-    factors = monomials(5, 3)
-    e = (
-        Polynomial(shift, scale, jnp.asarray(0.02 * rng.normal(size=(3, len(factors)))), factors)
-        if kind == "polynomial"
-        else Perceptron(
-            shift,
-            scale,
-            (jnp.asarray(rng.normal(size=(6, 5))), jnp.asarray(0.05 * rng.normal(size=(3, 6)))),
-            (jnp.asarray(rng.normal(size=6)), jnp.zeros(3)),
-        )
-    )
-    return replace(model, e=e, corrected=(0, 1, 2), signals=signals)
 
 
 def drive() -> Trajectory:

@@ -79,3 +79,30 @@ def test_names_and_units_are_those_that_openmdao_takes():
         "kN-m": "kN*m", "m/s^2": "m/s**2", "rpm": "rpm", "(deg)": "deg", "": None,
         "furlong?": None, "kN·m": "kN*m",
     }  # fmt: skip
+
+
+def test_units_mean_to_openmdao_what_they_mean_here():
+    from openmdao.utils.units import convert_units  # pyright: ignore[reportMissingImports]
+
+    from dfsm.core.units import conversion
+    from dfsm.exports.openmdao_component import _rate, unit_of
+
+    pairs = {"kN m": "N*m", "s-1": "1/min", "m s-2": "ft/s**2", "C": "degK", "deg F": "degC"}
+    pairs |= {"°": "rad", "kg m2": "g*m**2", "kNm": "J", "N.m/rad": "kN*m/deg", "m²": "mm**2"}
+    for unit, other in pairs.items():
+        scale, shift = conversion(unit, other.replace("degK", "K")) or (0.0, 0.0)
+        spelled = unit_of(unit)
+        assert spelled is not None, unit
+        assert convert_units(3.0, spelled, other) == pytest.approx(3.0 * scale + shift), unit
+    # A rate of a temperature has no zero to be told from.
+    assert {u: _rate(u) for u in ("degC", "kN m", "??")} == {
+        "degC": "K**1*s**-1", "kN m": "kN*m/s", "??": None,
+    }  # fmt: skip
+
+
+def test_a_component_takes_channels_in_units_with_spaces(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    A, B = np.array([[-1.0]]), np.array([[2.0]])
+    made, component, _points = problem(linear_model(A, B, names=["load"], units=["kN m"]))
+    value = made.get_val(component.variables["load"], units="N*m")
+    assert value == pytest.approx(1e3 * made.get_val(component.variables["load"]))

@@ -56,6 +56,10 @@ def test_files_hold_matrices_points_names_and_units(models, tmp_path):
     assert [str(c[0][0]) for c in mat["state_names"]] == ["q", "v"]
     assert [str(c[0][0]) for c in mat["input_units"]] == ["N", "m/s"]
     np.testing.assert_array_equal(mat["schedule"], [[7.0, 8.0]])
+    region = fits.scheduled().region
+    ends = np.stack([region.low, region.high], axis=1)[[2, 3, 0, 1]]  # states before inputs
+    np.testing.assert_array_equal(np.vstack([mat["state_ranges"], mat["input_ranges"]]), ends)
+    assert [c["trained"] for c in (*told["states"], *told["inputs"])] == ends.tolist()
     assert [i["role"] for i in told["inputs"]] == ["control", "disturbance"]
     assert told["schedule"]["name"] == "w"
     with pytest.raises(DfsmError, match=r"the suffix '.csv', expected .mat or .json"):
@@ -75,6 +79,19 @@ def test_systems_of_python_control_answer_as_the_model_does():
     pulse[0, 50:52] = 1.0
     answer = control.forced_response(system, time, pulse).outputs
     assert np.abs(np.atleast_2d(answer)).max() > 1e-3
+
+
+def test_names_with_dots_and_a_system_that_python_control_does_not_hold():
+    control = pytest.importorskip("control")
+    model = linear_model(A, B, C, names=["a.b", "a_b"])
+    (system,) = package.to_state_space(model).control()
+    assert system.state_labels == ["a_b_", "a_b"]
+    alone = model.linearize([0.0, 0.0], [0.0, 0.0], [])
+    assert alone.state_labels == ["a_b_", "a_b"]
+    assert np.atleast_2d(control.step_response(alone, [0, 1]).outputs).shape[-1] == 2
+    decay = linear_model(np.array([[-1.0]]), np.zeros((1, 0)))
+    with pytest.raises(DfsmError, match="one state and neither controls nor disturbances"):
+        package.to_state_space(decay).control()
 
 
 def test_a_point_without_a_steady_state_is_told_and_linearized_all_the_same():

@@ -157,6 +157,14 @@ def listed(text: str) -> bool:
     return known(text) and all(base in _BASES for base, _ in _read(_bare(text)).powers)
 
 
+def powers(text: str) -> dict[str, float]:
+    """Powers of m, s, rad, kg, K, A, mol, VA, var and cd that a unit is made of.
+
+    A word that is not in the table is a base of its own.
+    """
+    return dict(_read(_bare(text)).powers)
+
+
 def conversion(source: str, target: str) -> tuple[float, float] | None:
     """Factor and summand that take values in one unit to another, None between dimensions."""
     a, b = _read(_bare(source)), _read(_bare(target))

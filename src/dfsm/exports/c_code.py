@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from dfsm.core.files import check_folder, visible, write_folder
 from dfsm.core.version import __version__
 from dfsm.exports.casadi_model import c_functions
-from dfsm.exports.functions import GROUPS, description
+from dfsm.exports.functions import GROUPS, RESULTS, description
 from dfsm.exports.identifiers import comment, identifier, numbers, strings
 from dfsm.models.dfsm import DFSM
 
 _MARK = "/* Made by dfsm"
 _GROUPS = (*GROUPS, "outputs", "field")
+# What functions are called that CasADi writes under a short name.
+_LONG = {
+    "f": "derivative",
+    "g": "output",
+    "g_at_azimuth": "output_at_azimuth",
+    "d": "distance",
+}
+# What inputs do between samples, as numbers.
+_BETWEEN = ("hold", "linear", "cubic")
 
 
 @dataclass(frozen=True)
@@ -52,8 +63,9 @@ def to_c(model: DFSM, name: str = "model") -> CSource:
     -------
     CSource
         ``<name>_derivative`` and ``<name>_output``, which equal `DFSM.derivative` and
-        `DFSM.output` up to rounding, ``<name>_step``, one step of RK4, and names, units and start
-        values as arrays.
+        `DFSM.output` up to rounding, ``<name>_step``, one step of RK4, ``<name>_simulate``, a
+        rollout as `simulate` does it, ``<name>_distance``, how far from the training data a point
+        is, and names, units, start values and training ranges as arrays.
 
     Raises
     ------
@@ -65,12 +77,17 @@ def to_c(model: DFSM, name: str = "model") -> CSource:
     told = description(model)
     turning = "g_at_azimuth" in sizes
     header = _header(name, told, turning=turning)
-    parts = [f'{_first(name)}\n#include "{name}.h"\n', code, _arrays(name, told)]
-    parts += [_call(name, "f", "derivative", sizes["f"]), _call(name, "g", "output", sizes["g"])]
-    if turning:
-        parts.append(_call(name, "g_at_azimuth", "output_at_azimuth", sizes["g_at_azimuth"]))
-    parts.append(_STEP.replace("NAME", name).replace("UPPER", name.upper()))
+    parts = [f'{_first(name)}\n#include "{name}.h"\n#include <stdlib.h>\n', code]
+    parts += [_arrays(name, told), *(_call(name, short, size) for short, size in sizes.items())]
+    rollout = resources.files("dfsm.exports").joinpath("sources", "rollout.c")
+    parts.append(_named(rollout.read_text(encoding="ascii"), name))
     return CSource(name, header, "\n".join(parts), told)
+
+
+def _named(text: str, name: str) -> str:
+    """C code with the model's name for NAME, and its capitals for UPPER."""
+    names = {"NAME": name, "UPPER": name.upper()}
+    return re.sub("NAME|UPPER", lambda found: names[found[0]], text)
 
 
 def write_c(model: DFSM, path: str | Path, name: str | None = None) -> CSource:
@@ -119,9 +136,11 @@ def _header(name: str, told: dict[str, Any], *, turning: bool) -> str:
     for group in _GROUPS:
         lines += [f"extern const char *const {name}_{group}_names[];"]
         lines += [f"extern const char *const {name}_{group}_units[];"]
-    lines += [f"extern const double {name}_{g}_starts[];" for g in GROUPS]
+    for what in ("starts", "low", "high"):
+        lines += [f"extern const double {name}_{g}_{what}[];" for g in GROUPS]
+    lines += [f"extern const double {name}_longest_step; /* in s; 0 where nothing limits it */"]
     functions = _DECLARATIONS + (_TURNING if turning else "")
-    lines += [functions.replace("NAME", name), "#ifdef __cplusplus", "}", "#endif", "#endif", ""]
+    lines += [_named(functions, name), "#ifdef __cplusplus", "}", "#endif", "#endif", ""]
     return "\n".join(lines)
 
 
@@ -135,7 +154,9 @@ def _vectors(told: dict[str, Any]) -> list[str]:
             unit = f" ({comment(entry['unit'])})" if entry["unit"] else ""
             kind = entry.get("between_samples")
             between = f", {kind} between samples" if kind else ""
-            lines.append(f"  [{k}] {comment(entry['name'])}{unit}{between}")
+            low, high = entry.get("trained", (None, None))
+            trained = "" if low is None else f", trained from {low:.6g} to {high:.6g}"
+            lines.append(f"  [{k}] {comment(entry['name'])}{unit}{between}{trained}")
     if told["latent_states"]:
         names = comment(", ".join(told["latent_states"]))
         lines += textwrap.wrap(
@@ -153,15 +174,22 @@ def _arrays(name: str, told: dict[str, Any]) -> str:
     for group in _GROUPS:
         parts.append(strings(f"{name}_{group}_names", [e["name"] for e in told[group]]))
         parts.append(strings(f"{name}_{group}_units", [e["unit"] for e in told[group]]))
-    parts += [numbers(f"{name}_{g}_starts", [e["start"] for e in told[g]]) for g in GROUPS]
+    for g in GROUPS:
+        parts.append(numbers(f"{name}_{g}_starts", [e["start"] for e in told[g]]))
+        for k, end in enumerate(("low", "high")):
+            parts.append(numbers(f"{name}_{g}_{end}", [e["trained"][k] for e in told[g]]))
+    parts.append(f"const double {name}_longest_step = {float(told['step'] or 0.0)!r};\n")
+    kinds = [e["between_samples"] for g in ("controls", "disturbances") for e in told[g]]
+    places = ", ".join(str(_BETWEEN.index(kind)) for kind in kinds) or "0"
+    parts.append(f"static const int {name}_between[] = {{{places}}};\n")
     return "".join(parts)
 
 
-def _call(name: str, short: str, long: str, sizes: tuple[int, int, int, int]) -> str:
+def _call(name: str, short: str, sizes: tuple[int, int, int, int]) -> str:
     """The function with plain arguments around the one that CasADi wrote."""
     arg, res, iw, w = (max(1, s) for s in sizes)
     turning = short == "g_at_azimuth"
-    result = "derivatives" if short == "f" else "outputs"
+    long, result = _LONG[short], RESULTS[short]
     more = ", double azimuth, const double *field" if turning else ""
     given = ", &azimuth, field" if turning else ""
     return f"""int {name}_{long}(const double *states, const double *controls,
@@ -192,38 +220,22 @@ int NAME_step(double seconds, const double *states,
     const double *controls_start, const double *disturbances_start,
     const double *controls_end, const double *disturbances_end,
     const double *parameters, double *next);
+
+/* States at many times in s, one row each, of which the first is given. Inputs, one row per time,
+   are held, or go along lines or splines between two, as told above; intervals are divided where
+   the longest step is shorter. Returns 2 where times go back, or splines have fewer than four or
+   two at one instant, and 3 without memory. */
+int NAME_simulate(int samples, const double *time, const double *controls,
+    const double *disturbances, const double *parameters, double *states);
+
+/* How far from the training data: up to 1 inside them. Each signal is seen against its range, of
+   which the middle is 0 and both ends are 1, and all together against what occurred together. */
+int NAME_distance(const double *states, const double *controls, const double *disturbances,
+    const double *parameters, double *distance);
 """
 _TURNING = """
 /* Outputs at an azimuth in rad, in a wind field with these harmonics. */
 int NAME_output_at_azimuth(const double *states, const double *controls,
     const double *disturbances, const double *parameters, double azimuth, const double *field,
     double *outputs);
-"""
-_STEP = """int NAME_step(double seconds, const double *states,
-    const double *controls_start, const double *disturbances_start,
-    const double *controls_end, const double *disturbances_end,
-    const double *parameters, double *next) {
-  double k[4][UPPER_STATES], x[UPPER_STATES];
-  double u[UPPER_CONTROLS + 1], w[UPPER_DISTURBANCES + 1];
-  static const double shares[4] = {0.0, 0.5, 0.5, 1.0};
-  int i, s, failed;
-  for (s = 0; s < 4; ++s) {
-    const double share = shares[s];
-    for (i = 0; i < UPPER_STATES; ++i) {
-      x[i] = s ? states[i] + share * seconds * k[s - 1][i] : states[i];
-    }
-    for (i = 0; i < UPPER_CONTROLS; ++i) {
-      u[i] = (1.0 - share) * controls_start[i] + share * controls_end[i];
-    }
-    for (i = 0; i < UPPER_DISTURBANCES; ++i) {
-      w[i] = (1.0 - share) * disturbances_start[i] + share * disturbances_end[i];
-    }
-    failed = NAME_derivative(x, u, w, parameters, k[s]);
-    if (failed) return failed;
-  }
-  for (i = 0; i < UPPER_STATES; ++i) {
-    next[i] = states[i] + seconds / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
-  }
-  return 0;
-}
 """

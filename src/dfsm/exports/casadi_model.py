@@ -15,7 +15,7 @@ from typing import Any
 import casadi
 
 from dfsm.core.files import check_file, json_value, write_file
-from dfsm.exports.functions import description, programs
+from dfsm.exports.functions import RESULTS, description, programs
 from dfsm.exports.program import Program, Step
 from dfsm.models.dfsm import DFSM
 
@@ -41,6 +41,16 @@ _BINARY = {
     "or": casadi.logic_or,
 }
 
+# CasADi writes functions that nobody calls, and arguments that nobody takes.
+_LOUD = "#pragma GCC diagnostic pop\n"
+_QUIET = """#define CASADI_SYMBOL_EXPORT static
+#if defined(__GNUC__)
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-function"
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+"""
+
 
 @dataclass(frozen=True)
 class CasadiModel:
@@ -58,18 +68,23 @@ class CasadiModel:
     description
         Names, units and start values of all vectors, and which inputs must be computed from
         others before they are supplied; values that JSON can hold.
+    distance
+        `casadi.Function` of the same four: how far a point is from the training data, up to 1
+        inside them. It has kinks, for it is the farthest of all signals.
     """
 
     f: Any
     g: Any
     g_at_azimuth: Any
     description: dict[str, Any]
+    distance: Any
 
     def save(self, path: str | Path) -> None:
         """Write one file that CasADi reads without dfsm.
 
         `casadi.FileDeserializer(path).unpack()` returns in turn ``f``, ``g``, the description as
-        JSON and, if there is one, ``g_at_azimuth``; `casadi.Function.load(path)` returns ``f``.
+        JSON, ``g_at_azimuth`` if there is one, and ``distance``; `casadi.Function.load(path)`
+        returns ``f``.
 
         Raises
         ------
@@ -84,6 +99,7 @@ class CasadiModel:
             file.pack(json.dumps(json_value(self.description), ensure_ascii=True))
             if self.g_at_azimuth is not None:
                 file.pack(self.g_at_azimuth)
+            file.pack(self.distance)
             del file
 
 
@@ -107,9 +123,8 @@ def to_casadi(model: DFSM) -> CasadiModel:
         A term is a function with something in it that CasADi has not; names both.
     """
     functions = {name: to_function(program, name) for name, program in programs(model).items()}
-    return CasadiModel(
-        functions["f"], functions["g"], functions.get("g_at_azimuth"), description(model)
-    )
+    turned, distance = functions.get("g_at_azimuth"), functions["d"]
+    return CasadiModel(functions["f"], functions["g"], turned, description(model), distance)
 
 
 def c_functions(model: DFSM, name: str) -> tuple[str, dict[str, tuple[int, int, int, int]]]:
@@ -134,7 +149,7 @@ def c_functions(model: DFSM, name: str) -> tuple[str, dict[str, tuple[int, int, 
         function = to_function(program, short, prefix=f"{name}_")
         generator.add(function)
         sizes[short] = (function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w())
-    return f"#define CASADI_SYMBOL_EXPORT static\n{generator.dump()}", sizes
+    return f"{_QUIET}{generator.dump()}\n#if defined(__GNUC__)\n{_LOUD}#endif\n", sizes
 
 
 def to_function(program: Program, name: str, prefix: str = "") -> Any:
@@ -145,11 +160,9 @@ def to_function(program: Program, name: str, prefix: str = "") -> Any:
     values: list[Any] = [*arguments, *constants]
     for step in program.steps:
         values.append(_result(step, [values[k] for k in step.of]))
-    names = [n for n, _ in program.inputs]
-    what = "derivatives" if name == "f" else "outputs"
-    return casadi.Function(
-        prefix + name, arguments, [casadi.densify(values[program.result])], names, [what]
-    )
+    names, what = [n for n, _ in program.inputs], [RESULTS[name]]
+    result = [casadi.densify(values[program.result])]
+    return casadi.Function(prefix + name, arguments, result, names, what)
 
 
 def _result(step: Step, of: list[Any]) -> Any:

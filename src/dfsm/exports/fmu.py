@@ -15,7 +15,7 @@ import zipfile
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,13 +24,23 @@ from dfsm.core.settings import require
 from dfsm.errors import DfsmError
 from dfsm.exports.c_code import CSource, to_c
 from dfsm.exports.fmu_description import Variable, build_description, model_description
-from dfsm.exports.identifiers import numbers
+from dfsm.exports.identifiers import numbers, one_line
 from dfsm.models.dfsm import DFSM
 
 Kind = Literal["model-exchange", "co-simulation"]
 KINDS: tuple[Kind, ...] = ("model-exchange", "co-simulation")
 # Longest step of a co-simulation in s, unless told otherwise.
 _LONGEST = 0.1
+# What the last output is, and what a description says of inputs between samples.
+_DISTANCE = (
+    "training_distance",
+    "how far signals are from the training data: up to 1 inside them, where 1 is an end of a range",
+)
+_BETWEEN = {
+    "hold": "held between samples",
+    "linear": "goes along lines between samples",
+    "cubic": "goes along a spline between samples",
+}
 # Entries of an archive have this date, so that the same model makes the same file.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
@@ -82,8 +92,8 @@ def write_fmu(
         ``"model-exchange"``, ``"co-simulation"``, or None for both.
     step
         Longest Runge-Kutta step of a co-simulation in s, the start value of the parameter
-        ``rk4_step``; None takes the step that the model was made for, else half of what its
-        fastest eigenvalue allows, and 0.1 s at most.
+        ``rk4_step``; None takes the step that a model with hidden states was made for, for others
+        half of what the fastest eigenvalue allows, and 0.1 s at most.
 
     Raises
     ------
@@ -108,7 +118,7 @@ def write_fmu(
     source = _source(model, code, variables, fmi)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_OID, code.source + source + str((fmi, kinds)))}}}"
     source = source.replace("THE_TOKEN", token)
-    description = model_description(code.name, token, fmi, kinds, variables)
+    description = model_description(code.name, token, fmi, kinds, variables, step)
     files: dict[str, bytes] = {
         "modelDescription.xml": description,
         f"sources/{code.name}.c": code.source.encode(),
@@ -130,44 +140,58 @@ def write_fmu(
 
 def _safe_step(model: DFSM, longest: float | None) -> float:
     """The model's own step, or half of the longest one that is stable."""
-    if model.signals.step is not None or longest is None:
-        return min(_LONGEST, longest or _LONGEST)
-    return min(_LONGEST, 0.5 * longest)
+    if longest is not None and model.signals.step is not None:
+        return longest
+    return _LONGEST if longest is None else min(_LONGEST, 0.5 * longest)
 
 
 def _variables(code: CSource, step: float) -> tuple[Variable, ...]:
     """All variables in the order of their value references."""
     told, turn = code.description, code.description.get("azimuth")
-    states = [(e["name"], e["unit"], e["start"]) for e in told["states"]]
-    notes = ["latent state" if e in told["latent_states"] else "state" for e, *_ in states]
+    rows: list[tuple[str, str, float | None, str, str, bool]]
+    rows = [("time", "s", 0.0, "independent", "", False)]
+    latent = f"latent state, start value: {told['latent_starts']}"
+    for e in told["states"]:
+        note = latent if e["name"] in told["latent_states"] else "state"
+        rows.append((e["name"], e["unit"], e["start"], "state", _said(note, e), False))
     if turn is not None:
-        states.append(("azimuth", "rad", 0.0))
-        notes.append("state: the azimuth of the rotor")
-    rows = [("time", "s", 0.0, "independent", "")]
-    rows += [(*s, "state", note) for s, note in zip(states, notes, strict=True)]
-    rows += [
-        (f"der({n})", f"{unit}/s" if unit else "1/s", None, "derivative", "")
-        for n, unit, _ in states
-    ]
-    computed = {sentence.split(" ")[0]: sentence for sentence in told["computed_inputs"]}
+        rows.append(("azimuth", "rad", 0.0, "state", "state: the azimuth of the rotor", False))
+    states = rows[1:]
+    for name, unit, *_ in states:
+        rows.append((f"der({name})", f"{unit}/s" if unit else "1/s", None, "derivative", "", False))
     for group in ("controls", "disturbances", "field"):
         for e in told[group]:
-            note = computed.get(e["name"], group.removesuffix("s"))
-            rows.append((e["name"], e["unit"], e.get("start", 0.0), "input", note))
-    rows += [(e["name"], e["unit"], e["start"], "parameter", "") for e in told["parameters"]]
+            note, start = _said(group.removesuffix("s"), e), e.get("start", 0.0)
+            moves = e.get("between_samples", "hold") != "hold"
+            rows.append((e["name"], e["unit"], start, "input", note, moves))
+    for e in told["parameters"]:
+        rows.append((e["name"], e["unit"], e["start"], "parameter", _said("", e), False))
     note = "longest Runge-Kutta step of a co-simulation"
-    rows.append(("rk4_step", "s", step, "parameter", note))
-    rows += [(e["name"], e["unit"], None, "output", "") for e in told["outputs"]]
+    rows.append(("rk4_step", "s", step, "parameter", note, False))
+    rows += [(e["name"], e["unit"], None, "output", "", False) for e in told["outputs"]]
+    rows.append((_DISTANCE[0], "", None, "output", _DISTANCE[1], False))
     variables, taken = list[Variable](), set[str]()
-    for reference, (name, unit, start, role, note) in enumerate(rows):
-        plain, count = " ".join(name.split()) or "unnamed", 1
+    for reference, (name, unit, start, role, note, moves) in enumerate(rows):
+        plain = wanted = one_line(name) or "unnamed"
+        count = 1
         while plain in taken:
             count += 1
-            plain = f"{' '.join(name.split())}_{count}"
+            plain = f"{wanted}_{count}"
         taken.add(plain)
         of = reference - len(states) if role == "derivative" else None
-        variables.append(Variable(plain, unit, start, role, note, reference, of))
+        shown = (start, role, one_line(note), reference, of, moves)
+        variables.append(Variable(plain, one_line(unit), *shown))
     return tuple(variables)
+
+
+def _said(what: str, entry: dict[str, Any]) -> str:
+    """What a variable is, what it does between samples, and its training range."""
+    between = _BETWEEN.get(entry.get("between_samples", ""))
+    parts = [entry.get("computed", what), between]
+    if "trained" in entry:
+        low, high = entry["trained"]
+        parts.append(f"trained from {low:.6g} to {high:.6g}")
+    return ", ".join(part for part in parts if part)
 
 
 def _source(model: DFSM, code: CSource, variables: tuple[Variable, ...], fmi: int) -> str:
@@ -176,11 +200,12 @@ def _source(model: DFSM, code: CSource, variables: tuple[Variable, ...], fmi: in
     count = len(told["states"]) + (turn is not None)
     spread = np.asarray(model.region.scale)[model.signals.state_columns]
     nominal = [float(v) for v in spread] + [1.0] * (turn is not None)
-    lines = [f'#include "{name}.h"', f"#define COUNT_STATES {count}"]
+    lines = [f'#include "{name}.h"', f"#define COUNT__STATES {count}"]
     for group in ("controls", "disturbances", "field", "parameters", "outputs"):
-        lines.append(f"#define COUNT_{group.upper()} {len(told[group])}")
+        lines.append(f"#define COUNT__{group.upper()} {len(told[group])}")
     lines.append(f"#define MODEL_DERIVATIVE {name}_derivative")
     lines.append(f"#define MODEL_OUTPUT {name}_output{'_at_azimuth' if turn else ''}")
+    lines.append(f"#define MODEL_DISTANCE {name}_distance")
     lines.append(f"#define TURNS {int(turn is not None)}")
     if turn is not None:
         speed = [e["name"] for e in told["states"]].index(turn["speed"])
@@ -189,6 +214,8 @@ def _source(model: DFSM, code: CSource, variables: tuple[Variable, ...], fmi: in
     starts = [0.0 if v.start is None else v.start for v in variables]
     lines.append("static " + numbers("start_values", starts))
     lines.append("static " + numbers("nominal_values", nominal))
+    moves = ", ".join(str(int(v.moves)) for v in variables if v.role == "input") or "0"
+    lines.append(f"static const int moves_within[] = {{{moves}}};")
     folder = resources.files("dfsm.exports").joinpath("sources")
     files = ("instance.h", f"fmi{fmi}.c", "fmi.c")
     parts = [folder.joinpath(f).read_text(encoding="ascii") for f in files]

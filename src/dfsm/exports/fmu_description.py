@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from xml.etree import ElementTree
 
 from dfsm.core.version import __version__
@@ -30,6 +30,8 @@ class Variable:
         Value reference.
     derivative_of
         Value reference of the state whose derivative it is.
+    moves
+        Whether it is an input that goes on between samples: an importer may set it within a step.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Variable:
     note: str
     reference: int
     derivative_of: int | None = None
+    moves: bool = False
 
 
 # Causality, variability and initial of every role.
@@ -53,7 +56,12 @@ _ROLES = {
 
 
 def model_description(
-    name: str, token: str, fmi: int, kinds: Sequence[str], variables: Sequence[Variable]
+    name: str,
+    token: str,
+    fmi: int,
+    kinds: Sequence[str],
+    variables: Sequence[Variable],
+    step: float,
 ) -> bytes:
     """The XML of an FMU.
 
@@ -69,7 +77,11 @@ def model_description(
         Interfaces that it has.
     variables
         In the order of their value references.
+    step
+        Communication step in s that an importer is to take unless it is told another.
     """
+    if "co-simulation" not in kinds:  # nobody else has steps to set inputs within
+        variables = [replace(v, moves=False) for v in variables]
     about = {
         "fmiVersion": f"{fmi}.0",
         "modelName": name,
@@ -81,11 +93,13 @@ def model_description(
         about["numberOfEventIndicators"] = "0"
     root = Element("fmiModelDescription", about)
     for kind in kinds:
-        _interface(root, name, fmi, kind)
+        _interface(root, name, fmi, kind, moving=any(v.moves for v in variables))
     units = ElementTree.SubElement(root, "UnitDefinitions")
     for unit in sorted({v.unit for v in variables if v.unit}):
         ElementTree.SubElement(units, "Unit", {"name": unit})
-    ElementTree.SubElement(root, "DefaultExperiment", {"startTime": "0"})
+    ElementTree.SubElement(
+        root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(float(step))}
+    )
     listed = ElementTree.SubElement(root, "ModelVariables")
     for variable in variables:
         (_variable2 if fmi == 2 else _variable3)(listed, variable)
@@ -104,7 +118,7 @@ def build_description(name: str) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def _interface(root: Element, name: str, fmi: int, kind: str) -> None:
+def _interface(root: Element, name: str, fmi: int, kind: str, *, moving: bool) -> None:
     state = "FMUstate" if fmi == 2 else "FMUState"
     can = {"modelIdentifier": name, f"canGetAndSet{state}": "true"}
     can |= {f"canSerialize{state}": "true"}
@@ -113,6 +127,8 @@ def _interface(root: Element, name: str, fmi: int, kind: str) -> None:
         tag, can["canHandleVariableCommunicationStepSize"] = "CoSimulation", "true"
         if fmi == 2:
             can["canInterpolateInputs"] = "true"
+        elif moving:
+            can["providesIntermediateUpdate"] = "true"
     element = ElementTree.SubElement(root, tag, can)
     if fmi == 2:
         files = ElementTree.SubElement(element, "SourceFiles")
@@ -149,6 +165,8 @@ def _variable3(listed: Element, variable: Variable) -> None:
     told = _common(variable) | _numbers(variable)
     if variable.derivative_of is not None:
         told["derivative"] = str(variable.derivative_of)
+    if variable.moves:
+        told["intermediateUpdate"] = "true"
     ElementTree.SubElement(listed, "Float64", told)
 
 

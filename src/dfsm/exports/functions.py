@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.types import Array
@@ -23,14 +25,21 @@ from dfsm.simulation.fastest import REACH, fastest_rates
 GROUPS = ("states", "controls", "disturbances", "parameters")
 # What a model with blade-passing harmonics takes in addition.
 TURNING = ("azimuth", "field")
+# What the program of each name gives.
+RESULTS = {
+    "f": "derivatives",
+    "g": "outputs",
+    "g_at_azimuth": "outputs",
+    "d": "distance",
+}
 
 
 def programs(model: DFSM) -> dict[str, Program]:
-    """Programs of ``f`` and ``g``, and of ``g_at_azimuth`` where blades pass.
+    """Programs of ``f``, ``g`` and ``d``, and of ``g_at_azimuth`` where blades pass.
 
-    Both take states, controls, disturbances and parameters; ``g_at_azimuth`` takes in addition the
+    They take states, controls, disturbances and parameters; ``g_at_azimuth`` takes in addition the
     azimuth in rad and the harmonics of the wind field (none in a model that follows none). ``g``
-    of such a model is the average over a revolution.
+    of such a model is the average over a revolution. ``d`` is `training_distance`.
 
     Raises
     ------
@@ -48,10 +57,35 @@ def programs(model: DFSM) -> dict[str, Program]:
             return g(*groups, psi[0], field)
 
         functions["g_at_azimuth"] = (at_azimuth, [*inputs, *turning])
+    functions["d"] = (partial(training_distance, model), inputs)
     try:
         return {name: translated(*function) for name, function in functions.items()}
     except UntranslatableError as error:
         raise DfsmError(_refusal(model, str(error))) from None
+
+
+def training_distance(model: DFSM, *groups: Any) -> Any:
+    """How far a point is from the training data, ``(1,)``: more than 1 is outside them.
+
+    The larger of two: the signal that is farthest from the middle of its training range, of which
+    both ends are 1, and `Region.distance` of all together, the root of it, as a rollout tells it.
+
+    Parameters
+    ----------
+    model
+        The model.
+    *groups
+        Vectors of states, controls, disturbances and parameters.
+    """
+    region = model.region
+    low, high = np.asarray(region.low), np.asarray(region.high)
+    middle, half = (low + high) / 2, (high - low) / 2
+    # Of what never moved in training a billionth is as far as any other signal may be.
+    half = np.maximum(half, 1e-9 * np.where(middle != 0, np.abs(middle), 1.0))
+    inputs = model.signals.order.join(*groups)
+    alone = jnp.max(jnp.abs(inputs - middle) / half, initial=0.0)
+    together = jnp.sqrt(jnp.maximum(region.distance(inputs), 0.0))
+    return jnp.maximum(alone, together)[None]
 
 
 def _refusal(model: DFSM, primitive: str) -> str:
@@ -94,11 +128,16 @@ def description(model: DFSM) -> dict[str, Any]:
     told["latent_states"] = [c.name for c in s.latents]
     told["latent_starts"] = _latent_starts(model)
     told["step"] = longest_step(model)
-    told["computed_inputs"] = computed_inputs(model)
+    computed = computed_inputs(model)
+    for entry in (*told["controls"], *told["disturbances"], *told["parameters"]):
+        if entry["name"] in computed:
+            entry["computed"] = computed[entry["name"]]
+    told["computed_inputs"] = list(computed.values())
     told["notes"] = [*told["computed_inputs"]]
-    if s.startup:
+    if s.latents:
         names = ", ".join(told["latent_states"])
-        told["notes"].append(f"{names}, which nobody measures, start at {told['latent_starts']}")
+        starts = f"{'at ' if s.startup else ''}{told['latent_starts']}"
+        told["notes"].append(f"{names}, which nobody measures, start {starts}")
     rate = s.azimuth_rate
     if rate is not None:
         told["azimuth"] = {"unit": "rad", "speed": s.states[rate[0]].name, "rad/s": rate[1]}
@@ -139,9 +178,9 @@ def longest_step(model: DFSM) -> float | None:
     return min([*limits, REACH / rate] if rate > 0 else limits, default=None)
 
 
-def computed_inputs(model: DFSM) -> list[str]:
-    """What inputs must be supplied that dfsm would compute from others, a sentence each."""
-    s, sentences = model.signals, list[str]()
+def computed_inputs(model: DFSM) -> dict[str, str]:
+    """What inputs must be supplied that dfsm would compute from others, a sentence each by name."""
+    s, sentences = model.signals, dict[str, str]()
     used = set(s.order.exogenous)
     units = {c.name: c.unit for c in (*s.controls, *s.disturbances)}
     for feature in s.features:
@@ -159,12 +198,13 @@ def computed_inputs(model: DFSM) -> list[str]:
         else:
             how = f"{source} less {feature.less}"
         unit = units.get(feature.name, "")
-        sentences.append(f"{feature.name}{f' ({unit})' if unit else ''} is {how}: supply it")
+        named = f"{feature.name}{f' ({unit})' if unit else ''}"
+        sentences[feature.name] = f"{named} is {how}: supply it"
     if s.hub_height is not None:
         from dfsm.data.wind import CORRECTED_WIND
 
         if CORRECTED_WIND in used:
-            sentences.append(
+            sentences[CORRECTED_WIND] = (
                 f"{CORRECTED_WIND} is the rotor-averaged wind without what the platform's motion "
                 f"adds at a hub {s.hub_height:g} m above it: supply it"
             )

@@ -61,6 +61,11 @@ def comment(text: str) -> str:
     return plain.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ?/").rstrip("\\")
 
 
+def one_line(text: str) -> str:
+    """A text without what XML cannot hold or its readers change: single spaces for the rest."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
 def strings(name: str, texts: Iterable[str]) -> str:
     """The definition of an array of strings that ends with a null pointer."""
     listed = "".join(f"  {literal(t)},\n" for t in texts)

@@ -19,13 +19,17 @@ import numpy as np
 
 from dfsm.core.host import from_host
 from dfsm.core.types import Array
+from dfsm.core.units import conversion, listed, powers
 from dfsm.data.channel import Channel
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
 
 try:
     import openmdao.api as om  # pyright: ignore[reportMissingImports]
-    from openmdao.utils.units import valid_units  # pyright: ignore[reportMissingImports]
+    from openmdao.utils.units import (  # pyright: ignore[reportMissingImports]
+        unit_conversion,
+        valid_units,
+    )
 except ImportError:
     raise DfsmError("this needs OpenMDAO: pip install 'dfsm[openmdao]'") from None
 
@@ -113,9 +117,45 @@ def variables_of(model: DFSM) -> dict[str, str]:
 
 
 def unit_of(unit: str) -> str | None:
-    """A unit as OpenMDAO spells it; None for one that it does not know."""
-    spelled = unit.strip().strip("()").replace("^", "**").replace("·", "*").replace("-", "*")
-    return spelled if spelled and valid_units(spelled) else None
+    """A unit as OpenMDAO spells it; None for one that it does not know, or means otherwise by it.
+
+    To OpenMDAO ``C`` is a charge and ``kN m`` an error: what it is given means what dfsm reads.
+    """
+    plain = re.sub(r"^[(\[](.*)[)\]]$", r"\1", unit.strip())
+    if not listed(unit):
+        return plain if plain and _is_unit(plain) else None
+    made_of = powers(unit)
+    if not made_of:
+        return None
+    word = re.sub("[·⋅∙•×.]", "*", plain.replace("^", "**").replace("²", "**2").replace("³", "**3"))
+    joined = re.sub(r"(?<=[A-Za-z\d])[-\s]+(?=[A-Za-z])", "*", word)
+    raised = re.sub(r"(?<=[A-Za-z])(-?\d+)", r"**\1", joined)
+    # Nothing else than powers of base units is left where no spelling means the same.
+    base = "*".join(f"{name}**{power:g}" for name, power in made_of.items())
+    tried = [word, joined, raised, re.sub(r"N[Mm]\b", "N*m", raised), *_SPELLINGS, base]
+    return next((s for s in tried if _is_unit(s) and _means(s, unit, base)), None)
+
+
+# Of single units that the field spells in ways of its own.
+_SPELLINGS = ("deg", "degC", "degF", "rpm")
+
+
+def _is_unit(spelled: str) -> bool:
+    """Whether OpenMDAO knows a unit; it evaluates the text, which may raise anything."""
+    try:
+        return valid_units(spelled)
+    except Exception:
+        return False
+
+
+def _means(spelled: str, unit: str, base: str) -> bool:
+    """Whether OpenMDAO takes values of `spelled` to base units as dfsm does those of `unit`."""
+    ours = conversion(unit, base)
+    try:
+        scale, shift = unit_conversion(spelled, base)
+    except Exception:
+        return False
+    return ours is not None and np.allclose([scale, scale * shift], ours, rtol=1e-9, atol=0)
 
 
 def dependence(model: DFSM) -> Array:

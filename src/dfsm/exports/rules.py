@@ -7,26 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from dfsm.core.types import Array
-from dfsm.exports.translate import Traced, Translator, UntranslatableError, Value, computed
-
-Rule = Callable[[Translator, Any, list[Value]], list[Value]]
-
-
-def _shape(equation: Any) -> tuple[int, ...]:
-    return tuple(equation.outvars[0].aval.shape)
-
-
-def _is_whole(variable: Any) -> bool:
-    return np.issubdtype(variable.aval.dtype, np.integer)
-
-
-def _real(to: Translator, value: Value, name: str, shape: tuple[int, ...] | None = None) -> int:
-    traced = to.traced(value) if shape is None else to.spread(value, shape)
-    if traced.imag is not None:
-        raise UntranslatableError(f"{name} of complex numbers")
-    return traced.real
-
+from dfsm.exports.rules_of_axes import AXES
+from dfsm.exports.translate import Rule, Traced, Translator, UntranslatableError, Value, computed
+from dfsm.exports.translate import is_whole as _is_whole
+from dfsm.exports.translate import real_of as _real
+from dfsm.exports.translate import shape_of as _shape
 
 # -- elementwise --------------------------------------------------------------------------------
 
@@ -35,6 +20,17 @@ def _applied(name: str) -> Rule:
     def rule(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
         numbers = [_real(to, v, name, _shape(equation)) for v in operands]
         return [Traced(_shape(equation), to.steps.apply(name, *numbers))]
+
+    return rule
+
+
+def _logical(name: str) -> Rule:
+    """Of truths; on whole numbers JAX goes bit by bit."""
+
+    def rule(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
+        if equation.outvars[0].aval.dtype != bool:
+            raise UntranslatableError(f"{equation.primitive.name} of the bits of whole numbers")
+        return _applied(name)(to, equation, operands)
 
     return rule
 
@@ -170,8 +166,15 @@ def _converted(to: Translator, equation: Any, operands: list[Value]) -> list[Val
     if new.kind == "b" and old.kind != "b":
         zero = to.steps.constant(np.zeros(1))
         return [Traced(value.shape, to.steps.apply("ne", value.real, zero))]
-    if np.issubdtype(new, np.integer) and np.issubdtype(old, np.floating):
-        return [Traced(value.shape, _truncated(to, value.real))]
+    if new.kind == "u" or (new.kind == "i" and new.itemsize < 4):
+        raise UntranslatableError(f"whole numbers that end at {np.iinfo(new).max}")
+    if new.kind == "i" and np.issubdtype(old, np.floating):
+        number = _truncated(to, value.real)
+        if new.itemsize < 8:  # those beyond its ends become these
+            ends = (np.array([float(end)]) for end in (np.iinfo(new).min, np.iinfo(new).max))
+            low, high = (to.steps.constant(end) for end in ends)
+            number = to.steps.apply("min", to.steps.apply("max", number, low), high)
+        return [Traced(value.shape, number)]
     return [value]
 
 
@@ -328,93 +331,40 @@ def _never_zero(
     return np.flatnonzero((source.ravel()[flat[:, None] + starts] != 0).any(axis=1))
 
 
-# -- sums and products --------------------------------------------------------------------------
-
-
-def _reduced(name: str) -> Rule:
-    def rule(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
-        value = operands[0]
-        rank, axes = len(value.shape), tuple(equation.params["axes"])
-        numbers = np.arange(np.prod(value.shape), dtype=np.float64).reshape(value.shape)
-        order = [d for d in range(rank) if d not in axes] + list(axes)
-        columns = int(np.prod([value.shape[d] for d in axes]))
-        ordered = to.taken([value], np.transpose(numbers, order))
-        _real(to, ordered, f"reduce_{name}")
-        shape = _shape(equation)
-        rows = int(np.prod(shape))
-        return [Traced(shape, to.steps.reduce(name, to.full(ordered), (rows, columns)))]
-
-    return rule
-
-
-def _product(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
-    """Sums of products over axes, with or without axes that go along."""
-    (left_sum, right_sum), (left_along, right_along) = equation.params["dimension_numbers"]
-    left, right = operands
-    free = [
-        [d for d in range(len(v.shape)) if d not in gone]
-        for v, gone in ((left, {*left_sum, *left_along}), (right, {*right_sum, *right_along}))
-    ]
-    inner = int(np.prod([left.shape[d] for d in left_sum]))
-    along = int(np.prod([left.shape[d] for d in left_along]))
-    rows, columns = (
-        int(np.prod([v.shape[d] for d in f])) for v, f in zip(operands, free, strict=True)
-    )
-    shape = _shape(equation)
-
-    def ordered(value: Value, order: list[int]) -> Array:
-        numbers = np.arange(np.prod(value.shape), dtype=np.float64).reshape(value.shape)
-        return np.transpose(numbers, order)
-
-    a = ordered(left, [*left_along, *free[0], *left_sum]).reshape(along, rows, inner)
-    b = ordered(right, [*right_along, *right_sum, *free[1]]).reshape(along, inner, columns)
-    parts = [
-        to.steps.matmul(
-            to.full(to.taken([left], a[k])),
-            to.full(to.taken([right], b[k])),
-            (rows, inner, columns),
-        )
-        for k in range(along)
-    ]
-    return [Traced(shape, to.steps.join(parts))]
-
-
-def _unstacked(to: Translator, equation: Any, operands: list[Value]) -> list[Value]:
-    axis, (value,) = equation.params["axis"], operands
-    return [to.row(value, k, axis) for k in range(value.shape[axis])]
-
-
 RULES: dict[str, Rule] = {
     **{
         name: _applied(name)
         for name in (
             *("abs", "sign", "floor", "ceil", "sqrt", "log", "log1p", "expm1", "sin", "cos", "tan"),
             *("asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf"),
-            *("not", "pow", "atan2", "max", "min", "rem", "lt", "le", "gt", "ge", "eq", "ne"),
-            *("and", "or"),
+            *("pow", "atan2", "max", "min", "rem", "lt", "le", "gt", "ge", "eq", "ne"),
         )
     },
+    **{name: _logical(name) for name in ("not", "and", "or")},
+    "xor": _logical("ne"),
     **{name: _each_part(name) for name in ("add", "sub", "neg")},
     **{name: _part(name) for name in ("real", "imag")},
-    **{f"reduce_{name}": _reduced(name) for name in ("sum", "max", "min", "prod")},
+    **AXES,
     **{
         name: _moved
         for name in (
             *("broadcast_in_dim", "slice", "reshape", "squeeze", "expand_dims", "transpose"),
-            *("concatenate", "rev", "stack", "pad", "split", "scatter"),
+            *("concatenate", "rev", "stack", "pad", "split", "scatter", "tile"),
         )
     },
     **{name: _same for name in ("copy", "copy_p", "stop_gradient", "optimization_barrier")},
     "lt_to": _applied("lt"),
     "le_to": _applied("le"),
-    "reduce_and": _reduced("min"),
-    "reduce_or": _reduced("max"),
     "mul": _mul,
     "add_any": _each_part("add"),
     "exp": _exp,
     "complex": _complex,
     "conj": _conj,
     "div": _div,
+    # What is not finite is not zero beside itself.
+    "is_finite": _composed(
+        lambda apply, constant, x: apply("eq", apply("sub", x, x), constant(0.0))
+    ),
     "square": _composed(lambda apply, _constant, x: apply("mul", x, x)),
     "rsqrt": _composed(lambda apply, constant, x: apply("div", constant(1.0), apply("sqrt", x))),
     "exp2": _composed(
@@ -432,12 +382,10 @@ RULES: dict[str, Rule] = {
     ),
     "integer_pow": _power,
     "polynomial": _polynomial,
-    "unstack": _unstacked,
     "convert_element_type": _converted,
     "select_n": _select,
     "clamp": _clamp,
     "round": _round,
     "dynamic_slice": _sliced,
     "gather": _gathered,
-    "dot_general": _product,
 }

@@ -5,6 +5,7 @@
     model = Model("model.npz")
     model.derivative(states, controls, disturbances, parameters)    # per second
     model.output(states, controls, disturbances, parameters)
+    model.distance(states, controls, disturbances, parameters)    # more than 1: not in the data
     states, outputs = model.simulate(time, initial, controls, disturbances, parameters)
 
 Names, units and start values of all vectors, in order, stand in `model.description`.
@@ -143,6 +144,10 @@ class Model:
         turning = np.array([float(azimuth)]), np.asarray(field, dtype=float)
         return self.programs["g_at_azimuth"](*vectors, *turning)
 
+    def distance(self, states, controls, disturbances, parameters=()):
+        """How far a point is from the training data: up to 1 inside them."""
+        return self.programs["d"](*self._vectors((states, controls, disturbances, parameters)))[0]
+
     def simulate(
         self, time, initial, controls, disturbances, parameters=(), azimuth=None, field=None
     ):
@@ -153,6 +158,8 @@ class Model:
         shorter `step`. `azimuth` is the first one in rad, `field` has rows too.
         """
         rows, h = len(time), np.diff(time)
+        if not (h >= 0).all():
+            raise ValueError("times go back, or are no numbers: give them in order")
         u, w = (np.asarray(v, dtype=float).reshape(rows, -1) for v in (controls, disturbances))
         kinds = [e["between_samples"] for g in GROUPS[1:3] for e in self.description[g]]
         inputs, first = between(np.asarray(time, dtype=float), np.hstack([u, w]), kinds), u.shape[1]

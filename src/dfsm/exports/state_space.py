@@ -16,6 +16,7 @@ from dfsm.core.types import Array
 from dfsm.core.version import __version__
 from dfsm.data.channel import Channel
 from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.models.control_system import control_system
 from dfsm.models.dfsm import DFSM
 from dfsm.models.steady import operating_point, steady_state
 
@@ -79,6 +80,8 @@ class StateSpaceModels(Sequence[Linearization]):
         What the vectors hold; inputs are controls, then disturbances.
     schedule
         The scheduling signal; None for an LTI model.
+    state_ranges, input_ranges, parameter_ranges
+        Lowest and highest values of the training data, shapes ``(n, 2)``.
     """
 
     points: tuple[Linearization, ...]
@@ -87,6 +90,9 @@ class StateSpaceModels(Sequence[Linearization]):
     parameters: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     schedule: Channel | None
+    state_ranges: Array
+    input_ranges: Array
+    parameter_ranges: Array
 
     def __len__(self) -> int:
         return len(self.points)
@@ -114,20 +120,11 @@ class StateSpaceModels(Sequence[Linearization]):
         Raises
         ------
         DfsmError
-            python-control is not installed.
+            python-control is not installed, or holds no such system, see `control_system`.
         """
-        try:
-            import control
-        except ImportError:
-            raise DfsmError(
-                "state-space systems need python-control: pip install 'dfsm[control]'"
-            ) from None
-        names = {
-            "states": [c.name for c in self.states],
-            "inputs": [c.name for c in self.inputs],
-            "outputs": [c.name for c in self.outputs],
-        }
-        return [control.StateSpace(p.A, p.B, p.C, p.D, **names) for p in self.points]
+        groups = (self.states, self.inputs, self.outputs)
+        names = [[c.name for c in group] for group in groups]
+        return [control_system((p.A, p.B, p.C, p.D), *names) for p in self.points]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values: matrices, points, names and units."""
@@ -136,9 +133,9 @@ class StateSpaceModels(Sequence[Linearization]):
             "made_by": f"dfsm {__version__}",
             "equations": _EQUATIONS,
             "schedule": None if self.schedule is None else _described([self.schedule])[0],
-            "states": _described(self.states),
-            "inputs": _described(self.inputs),
-            "parameters": _described(self.parameters),
+            "states": _described(self.states, self.state_ranges),
+            "inputs": _described(self.inputs, self.input_ranges),
+            "parameters": _described(self.parameters, self.parameter_ranges),
             "outputs": _described(self.outputs),
             "points": [
                 {
@@ -156,7 +153,8 @@ class StateSpaceModels(Sequence[Linearization]):
         """Write a file for MATLAB and Simulink, ``.mat``, or ``.json``.
 
         In ``.mat``, points are the last axis: ``ss(A, B, C, D)`` is an array of systems, and
-        ``x0(:, k)`` belongs to ``A(:, :, k)``; names and units are cell arrays.
+        ``x0(:, k)`` belongs to ``A(:, :, k)``; names and units are cell arrays, and
+        ``state_ranges`` and so on are the training ranges.
 
         Parameters
         ----------
@@ -196,6 +194,9 @@ class StateSpaceModels(Sequence[Linearization]):
         return {
             **stacked,
             **cells,
+            "state_ranges": self.state_ranges,
+            "input_ranges": self.input_ranges,
+            "parameter_ranges": self.parameter_ranges,
             "schedule": np.array(schedule, dtype=float).reshape(1, -1),
             "steady": np.array([[p.steady for p in self.points]]),
             "messages": _cells(p.message for p in self.points),
@@ -288,6 +289,7 @@ def to_state_space(
         )
     s = model.signals
     column = model.f.schedule
+    ranges = np.stack([model.region.low, model.region.high], axis=1)
     return StateSpaceModels(
         points,
         s.states,
@@ -295,6 +297,9 @@ def to_state_space(
         s.parameters,
         s.outputs,
         None if column is None else s.inputs[column],
+        state_ranges=ranges[s.state_columns],
+        input_ranges=ranges[s.order.driving_columns],
+        parameter_ranges=ranges[s.order.columns("parameters")],
     )
 
 
@@ -351,8 +356,11 @@ def _linearized(model: DFSM, value: float | None, held: dict[str, Array | None])
     )
 
 
-def _described(channels: Sequence[Channel]) -> list[dict[str, Any]]:
-    return [{"name": c.name, "unit": c.unit, "role": c.role} for c in channels]
+def _described(channels: Sequence[Channel], ranges: Array | None = None) -> list[dict[str, Any]]:
+    told = [{"name": c.name, "unit": c.unit, "role": c.role} for c in channels]
+    if ranges is None:
+        return told
+    return [{**entry, "trained": ends.tolist()} for entry, ends in zip(told, ranges, strict=True)]
 
 
 def _cells(texts: Any) -> np.ndarray:

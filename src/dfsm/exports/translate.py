@@ -48,6 +48,26 @@ class Traced:
 
 
 Value = Traced | np.ndarray
+# How a primitive of JAX is said in steps: for its equation and operands, its results.
+Rule = Callable[["Translator", Any, list[Value]], list[Value]]
+
+
+def shape_of(equation: Any) -> tuple[int, ...]:
+    """Shape of an equation's first result."""
+    return tuple(equation.outvars[0].aval.shape)
+
+
+def is_whole(variable: Any) -> bool:
+    """Whether a variable holds whole numbers."""
+    return np.issubdtype(variable.aval.dtype, np.integer)
+
+
+def real_of(to: Translator, value: Value, name: str, shape: tuple[int, ...] | None = None) -> int:
+    """Number of a value without imaginary part, as an operand of a shape where one is given."""
+    traced = to.traced(value) if shape is None else to.spread(value, shape)
+    if traced.imag is not None:
+        raise UntranslatableError(f"{name} of complex numbers")
+    return traced.real
 
 
 def translated(function: Callable[..., jax.Array], inputs: Sequence[tuple[str, int]]) -> Program:

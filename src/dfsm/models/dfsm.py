@@ -267,23 +267,13 @@ class DFSM(eqx.Module):
         Raises
         ------
         DfsmError
-            python-control is not installed.
+            python-control is not installed, or holds no such system, see `control_system`.
         """
-        try:
-            import control
-        except ImportError:
-            raise DfsmError("linearize needs python-control: pip install 'dfsm[control]'") from None
-        A, B, C, D = self.jacobians(states, controls, disturbances, parameters)
+        from dfsm.models.control_system import control_system
+
+        matrices = self.jacobians(states, controls, disturbances, parameters)
         names = self.signals.names
-        return control.StateSpace(
-            A,
-            B,
-            C,
-            D,
-            states=list(names("states")),
-            inputs=[*names("controls"), *names("disturbances")],
-            outputs=list(names("outputs")),
-        )
+        return control_system(matrices, names("states"), self.signals.driving, names("outputs"))
 
     def linear_state_matrices(self) -> Array:
         """A of the linear fit at every schedule point, ``(point, state, state)``.

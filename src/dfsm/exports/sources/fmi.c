@@ -43,15 +43,15 @@ API FMI(Status) FMI(SetTime)(void *c, double t) { SELF; m->now.value[0] = t; ret
 API FMI(Status) FMI(SetContinuousStates)(void *c, const double x[], size_t n) {
   SELF;
   m->now.stale = 1;
-  ANSWER(states_copied(m->now.value + AT_STATES, x, n));
+  ANSWER(states_copied(m->now.value + AT__STATES, x, n));
 }
 API FMI(Status) FMI(GetContinuousStates)(void *c, double x[], size_t n) {
-  SELF; ANSWER(states_copied(x, m->now.value + AT_STATES, n));
+  SELF; ANSWER(states_copied(x, m->now.value + AT__STATES, n));
 }
 API FMI(Status) DERIVATIVES(void *c, double dx[], size_t n) {
   SELF;
   ANSWER(update(m) ? "no derivatives of these states"
-                   : states_copied(dx, m->now.value + AT_RATES, n));
+                   : states_copied(dx, m->now.value + AT__RATES, n));
 }
 API FMI(Status) FMI(GetNominalsOfContinuousStates)(void *c, double x[], size_t n) {
   SELF; ANSWER(states_copied(x, nominal_values, n));

@@ -27,7 +27,8 @@ typedef char Byte;
 
 static fmi2Status told(Instance *m, fmi2Status status, const char *text) {
   if (status != fmi2OK && m->logger) {
-    ((fmi2Logger)m->logger)(m->environment, m->name, status, "logStatusError", text);
+    const char *kind = status == fmi2Warning ? "logStatusWarning" : "logStatusError";
+    ((fmi2Logger)m->logger)(m->environment, m->name, status, kind, text);
   }
   return status;
 }
@@ -43,7 +44,7 @@ API fmi2Component fmi2Instantiate(const char *name, int type, const char *guid,
   if (!guid || strcmp(guid, MODEL_TOKEN)) return NULL;
   m = instance_new(name);
   if (m && callbacks) {
-    m->logger = (void *)callbacks->logger;
+    m->logger = (Function)callbacks->logger;
     m->environment = callbacks->environment;
     m->logging = logging;
   }
@@ -90,10 +91,11 @@ API fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueRefer
   size_t i;
   SELF;
   for (i = 0; i < n; ++i) {
-    if (order[i] != 1 || r[i] < AT_INPUTS || r[i] >= AT_PARAMETERS || !isfinite(v[i])) {
-      return told(m, fmi2Error, "only first derivatives of inputs can be set");
+    if (order[i] < 1 || order[i] > 3 || r[i] < AT__INPUTS || r[i] >= AT__PARAMETERS
+        || !isfinite(v[i])) {
+      return told(m, fmi2Error, "first to third derivatives of inputs can be set");
     }
-    m->now.slope[r[i] - AT_INPUTS] = v[i];
+    m->now.slope[order[i] - 1][r[i] - AT__INPUTS] = v[i];
   }
   return fmi2OK;
 }
@@ -103,9 +105,12 @@ API fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueRefe
   return n ? told(m, fmi2Error, "derivatives of outputs are not provided") : fmi2OK;
 }
 API fmi2Status fmi2DoStep(fmi2Component c, double t, double h, fmi2Boolean noSetPrior) {
-  SELF; (void)noSetPrior;
-  return march(m, t, h) ? told(m, fmi2Error, "the step could not be made: a state is not finite")
-                        : fmi2OK;
+  const char *problem;
+  SELF;
+  (void)noSetPrior;
+  problem = march(m, t, h);
+  if (!problem && strays(m)) told(m, fmi2Warning, STRAYED);
+  return problem ? told(m, fmi2Error, problem) : fmi2OK;
 }
 API fmi2Status fmi2CancelStep(fmi2Component c) { SELF; return fmi2Error; }
 API fmi2Status fmi2GetStatus(fmi2Component c, int k, fmi2Status *v) {

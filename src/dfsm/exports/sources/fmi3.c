@@ -17,7 +17,8 @@ typedef uint8_t Byte;
 
 static fmi3Status told(Instance *m, fmi3Status status, const char *text) {
   if (status != fmi3OK && m->logger) {
-    ((fmi3Logger)m->logger)(m->environment, status, "logStatusError", text);
+    const char *kind = status == fmi3Warning ? "logStatusWarning" : "logStatusError";
+    ((fmi3Logger)m->logger)(m->environment, status, kind, text);
   }
   return status;
 }
@@ -29,7 +30,7 @@ static fmi3Instance made(const char *name, const char *token, bool logging, void
   if (m) {
     m->logging = logging;
     m->environment = environment;
-    m->logger = (void *)logger;
+    m->logger = (Function)logger;
   }
   return m;
 }
@@ -40,13 +41,27 @@ API fmi3Instance fmi3InstantiateModelExchange(const char *name, const char *toke
   (void)resources; (void)visible;
   return made(name, token, logging, environment, logger);
 }
+typedef void (*fmi3Update)(void *, double, bool, bool, bool, bool, bool *, double *);
+
+/* Inputs at a time within a step, which the importer sets while it is asked. */
+static int asked(Instance *m, double time) {
+  bool early = false;
+  double stop = time;
+  m->refused = 0;
+  ((fmi3Update)m->update)(m->environment, time, true, false, false, false, &early, &stop);
+  return !m->refused;
+}
 API fmi3Instance fmi3InstantiateCoSimulation(const char *name, const char *token,
     const char *resources, bool visible, bool logging, bool eventMode, bool earlyReturn,
     const fmi3ValueReference required[], size_t n, void *environment, fmi3Logger logger,
-    void *intermediate) {
-  (void)resources; (void)visible; (void)eventMode; (void)earlyReturn; (void)required; (void)n;
-  (void)intermediate;
-  return made(name, token, logging, environment, logger);
+    fmi3Update update) {
+  Instance *m = (Instance *)made(name, token, logging, environment, logger);
+  (void)resources; (void)visible; (void)eventMode; (void)earlyReturn; (void)required;
+  if (m && update && n) {
+    m->ask = asked;
+    m->update = (Function)update;
+  }
+  return m;
 }
 API fmi3Instance fmi3InstantiateScheduledExecution(const char *name, const char *token,
     const char *resources, bool visible, bool logging, void *environment, fmi3Logger logger,
@@ -159,7 +174,7 @@ API fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) {
   SELF; *n = 0; return fmi3OK;
 }
 API fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) {
-  SELF; *n = COUNT_STATES; return fmi3OK;
+  SELF; *n = COUNT__STATES; return fmi3OK;
 }
 
 /* -- co-simulation -- */
@@ -170,15 +185,14 @@ API fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference
 }
 API fmi3Status fmi3DoStep(fmi3Instance c, double t, double h, bool noSetPrior, bool *event,
     bool *terminate, bool *early, double *last) {
-  fmi3Status status = fmi3OK;
+  const char *text;
   SELF;
   (void)noSetPrior;
   *event = *terminate = *early = false;
-  if (march(m, t, h)) {
-    status = told(m, fmi3Error, "the step could not be made: a state is not finite");
-  }
+  text = march(m, t, h);
   *last = m->now.value[0];
-  return status;
+  if (!text && strays(m)) told(m, fmi3Warning, STRAYED);
+  return text ? told(m, fmi3Error, text) : fmi3OK;
 }
 API fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference r, double t) {
   SELF; (void)r; (void)t; return fmi3Error;
