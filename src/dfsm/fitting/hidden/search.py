@@ -47,7 +47,8 @@ _SCOUTS = 4
 _MOST_MONOMIALS = 60
 # Polynomials go on to so many times what was recorded.
 _BEYOND = 1.5
-# Steps to follow a change of the integration, and to learn from all of many data at last.
+# Steps to follow a change of the integration, and to learn from all data at last: the fewest, and
+# all there are where data are many.
 _FOLLOW, _LAST = 8, 5
 # Samples that tell the state at the start of a window.
 _HEAD = 100
@@ -116,12 +117,15 @@ def search(
     windows = windows_of(records, standard, kinds, 1, settings.samples)
     linear = _behind(records, standard, (kinds, windows), settings)
     gains = {c: candidate.error for c, candidate in linear.items()}
+    if settings.count is not None:
+        linear = {settings.count: linear[settings.count]}
     first = _promising(linear)[0]
     kinds, kinds_tried = _interpolation(
         records, standard, linear[first], (kinds, open_kinds), settings
     )
     windows = windows_of(records, standard, kinds, 1, settings.samples)
     best, tried = _ascended(linear, windows, settings, seed)
+    further = last_steps(best, settings.iterations)
     best, steps = _steps(records, standard, best, kinds, settings)
     everything = windows_of(records, standard, kinds, steps).with_all()
     error = best.error
@@ -129,7 +133,7 @@ def search(
         best, windows_of(records, standard, kinds, steps, settings.samples), everything
     )
     few = everything.used.sum() <= settings.samples
-    last = settings.iterations if few else _LAST
+    last = further if few else _LAST
     final = improved(best.form, everything, weights, settings.decay, last)
     final = replace(final, error=error)
     return Found(final, standard, kinds, steps, everything, gains, tried, kinds_tried)
@@ -161,7 +165,10 @@ def _linear(
 ) -> dict[int, Candidate]:
     """Linear systems by the number of hidden states."""
     ny, nv = len(standard.outputs[0]), len(standard.inputs[0])
-    counts = range(settings.most + 1) if settings.count is None else [settings.count]
+    counts: Sequence[int] = range(settings.most + 1)
+    if settings.count is not None:
+        # Fewer tell whether there are too many.
+        counts = sorted({settings.count // 2, max(0, settings.count - 1), settings.count})
     found = subspace(told.records, standard, ny + max(counts))
     room, (unfolded, seen) = ny + max(counts), windows
     each = [linear_start(found, Form(ny + c, ny, nv, room=room), unfolded) for c in counts]
@@ -297,6 +304,17 @@ def _steps(
         steps *= 2
         best = improved(best.form, finer, best.weights, settings.decay, _FOLLOW)
     return best, steps
+
+
+def last_steps(best: Candidate, limit: int) -> int:
+    """Steps on all data: where data left out ended a search early, nothing else tells when to end.
+
+    As far as these let the search go in its second half, so are the last steps of all there may be.
+    A linear system, or a search that came to its end, is followed to the end.
+    """
+    if best.form.kind == "none" or not best.steps:
+        return limit
+    return min(limit, max(_LAST, 2 * best.steps - limit))
 
 
 def _restarted(best: Candidate, few: Windows, everything: Windows) -> Array:

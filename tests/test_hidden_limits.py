@@ -1,0 +1,108 @@
+"""Hidden states beyond what the data tell, without inputs, from runs of two rates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from dfsm.data.derivatives import StateSpec
+from dfsm.data.trajectory import Channel, Trajectory
+from dfsm.errors import DfsmError, DfsmWarning
+from dfsm.fitting.fit import fit
+from dfsm.fitting.hidden.form import Form
+from dfsm.fitting.hidden.search import last_steps
+from dfsm.fitting.hidden.settings import HiddenSettings
+from dfsm.fitting.hidden.starts import Candidate
+from dfsm.fitting.settings import FitSettings
+from dfsm.simulation.simulate import simulate
+
+# An oscillator whose velocity nobody measures: eigenvalues -0.15 ± 1.6i.
+A = np.array([[0.0, 1.0], [-(0.15**2 + 1.6**2), -0.3]])
+SETTINGS = FitSettings(
+    states=(StateSpec(name="q"),),
+    inputs="hold",
+    nonlinear_only=False,
+    hidden=HiddenSettings(count=1, form="none"),
+)
+
+
+def decay(start: tuple[float, float], step: float = 0.1, samples: int = 160) -> Trajectory:
+    """A free oscillation, exact."""
+    over, x = expm(A * step), [np.array(start)]
+    for _ in range(samples - 1):
+        x.append(over @ x[-1])
+    q = np.array(x)[:, :1]
+    time = step * np.arange(samples)
+    return Trajectory(time, q, (Channel("q", "m"),), name=f"free from {start} every {step:g} s")
+
+
+def driven(seed: int, samples: int = 300) -> Trajectory:
+    """The same under an input that is held, with noise of a fiftieth of what is seen."""
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-1, 1, samples // 5).repeat(5)
+    over = expm(np.block([[A, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) * 0.2)
+    x, q = np.zeros(2), np.empty(samples)
+    for k, v in enumerate(u):
+        q[k] = x[0]
+        x = over[:2, :2] @ x + over[:2, 2] * v
+    q += 0.02 * q.std() * rng.standard_normal(samples)
+    channels = (Channel("u", "N"), Channel("q", "m"))
+    return Trajectory(0.2 * np.arange(samples), np.stack([u, q], axis=1), channels, name="driven")
+
+
+def test_a_system_without_inputs_has_hidden_states_too() -> None:
+    """What is measured in half the run tells the velocity there, and so the rest of it."""
+    model = fit([decay((1.0, 0.0)), decay((-0.5, 2.0))], SETTINGS).model
+    new = decay((0.3, -1.5))
+    free = simulate(model, new, start=8.0).trajectory
+    np.testing.assert_allclose(free["q"], new["q"][80:], atol=0.01 * new["q"].std())
+    whole = simulate(model, new).trajectory
+    np.testing.assert_allclose(whole["q"], new["q"], atol=0.01 * new["q"].std())
+
+
+def test_more_hidden_states_than_the_data_tell_are_told() -> None:
+    settings = FitSettings(
+        states=(StateSpec(name="q"),),
+        controls=("u",),
+        nonlinear_only=False,
+        hidden=HiddenSettings(count=4, form="none"),
+    )
+    match = r"hidden.count is 4, more than the data can tell: .* set hidden.count to [23], or"
+    with pytest.warns(DfsmWarning, match=match):
+        result = fit([driven(1)], settings)
+    assert [*result.model.provenance.record["hidden"]["by_count"]] == ["2", "3", "4"]
+    assert len(result.model.signals.latents) == 4
+
+
+def test_as_many_hidden_states_as_there_are_are_no_reason_to_doubt() -> None:
+    settings = FitSettings(
+        states=(StateSpec(name="q"),),
+        controls=("u",),
+        nonlinear_only=False,
+        hidden=HiddenSettings(count=1, form="none"),
+    )
+    told = fit([driven(1)], settings).model.provenance.record
+    assert not any("more than the data" in text for text in told["warnings"])
+    by_count = told["hidden"]["by_count"]
+    assert by_count["1"] < 0.2 * by_count["0"]
+
+
+def test_runs_of_two_rates_are_refused_by_the_rates_that_there_are() -> None:
+    runs = [decay((1.0, 0.0)), decay((0.0, 1.0), 0.2)]
+    with pytest.raises(DfsmError, match=r"every 0.2 s has samples 0.2 s apart, where 0.1 s are"):
+        fit(runs, SETTINGS)
+
+
+def test_the_last_steps_go_as_far_as_data_left_out_let_the_search_go() -> None:
+    """Where these ended it early, it would go on learning noise of the few data there are."""
+    tanh = Form(2, 1, 1, "tanh", 2)
+
+    def taken(steps: int, form: Form = tanh) -> int:
+        return last_steps(Candidate(form, np.zeros(form.size), 0.1, steps), 40)
+
+    assert taken(20) == taken(21) == 5
+    assert taken(30) == 20
+    assert taken(42) == 40
+    # Linear systems and searches that came to their end are followed to the end.
+    assert taken(20, Form(2, 1, 1)) == taken(0) == 40
