@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def record(
     tight = {"rtol": 1e-8, "atol": 1e-10}
     if held:
         x = [np.array(start)]
-        for a, b in zip(time[:-1], time[1:], strict=True):
+        for a, b in pairwise(time):
             x.append(solve_ivp(rate, (a, b), x[-1], args=(u(a),), **tight).y[:, -1])
         y = np.array(x)[:, 0]
     else:

@@ -119,9 +119,10 @@ def search(
     gains = {c: candidate.error for c, candidate in linear.items()}
     if settings.count is not None:
         linear = {settings.count: linear[settings.count]}
-    first = _promising(linear)[0]
+    counts = _promising(linear, windows, settings)
+    linear = {c: linear[c] for c in counts}
     kinds, kinds_tried = _interpolation(
-        records, standard, linear[first], (kinds, open_kinds), settings
+        records, standard, linear[counts[0]], (kinds, open_kinds), settings
     )
     windows = windows_of(records, standard, kinds, 1, settings.samples)
     best, tried = _ascended(linear, windows, settings, seed)
@@ -180,11 +181,33 @@ def _linear(
     return dict(zip(counts, each, strict=True))
 
 
-def _promising(linear: dict[int, Candidate]) -> list[int]:
-    """Numbers of hidden states from the least that a linear system is nearly as good with."""
-    least = min(c.error for c in linear.values())
-    first = min(c for c in linear if linear[c].error <= _NEARLY * least)
-    return [c for c in sorted(linear) if c >= first and np.isfinite(linear[c].error)]
+def _promising(
+    linear: dict[int, Candidate], windows: Windows, settings: HiddenSettings
+) -> list[int]:
+    """Numbers of hidden states to try, from the fewest that may be enough.
+
+    A linear system takes what is nonlinear for further states. So where one with more is far
+    better, the simplest nonlinear start is asked whether fewer do.
+    """
+    known = [c for c in sorted(linear) if np.isfinite(linear[c].error)]
+    least = min(linear[c].error for c in known)
+    first = next(c for c in known if linear[c].error <= _NEARLY * least)
+    fewer = [c for c in reversed(known) if c < first]
+    if fewer and settings.form != "none":
+        least = _simplest(linear[first], windows, settings)
+        for count in fewer:
+            error = _simplest(linear[count], windows, settings)
+            if not error <= _NEARLY * least:
+                break
+            first, least = count, min(least, error)
+    return [c for c in known if c >= first]
+
+
+def _simplest(linear: Candidate, windows: Windows, settings: HiddenSettings) -> float:
+    """Squared error on data left out of the simplest nonlinear start there is."""
+    form = _forms(linear.form, windows, settings, 0)[0][0]
+    start = nonlinear_start(linear, form, 0)
+    return improved(form, windows, start, settings.decay, settings.iterations).error
 
 
 def _ascended(
@@ -196,7 +219,7 @@ def _ascended(
     Few draws tell how many there are, and whether the others are worth drawing.
     """
     best, others, tried = None, None, []
-    for count in _promising(linear):
+    for count in linear:
         tasks = _forms(linear[count].form, windows, settings, seed)
         candidates = list(_nonlinear(linear[count], windows, settings, tasks[:_SCOUTS]))
         tried += [(c.form.kind, count, c.error) for c in candidates]
@@ -269,16 +292,13 @@ def _interpolation(
     now, open_kinds = kinds
     if not any(open_kinds):
         return now, {}
-    at_hand = windows_of(records, standard, now, 1, settings.samples)
-    form = _forms(linear.form, at_hand, settings, 0)[0][0]
-    start = nonlinear_start(linear, form, 0)
     tried: dict[str, tuple[Between, ...]] = {}
     errors: dict[str, float] = {}
     for kind in get_args(Between):
         pairs = zip(now, open_kinds, strict=True)
         tried[kind] = tuple(kind if free else k for k, free in pairs)
         windows = windows_of(records, standard, tried[kind], 1, settings.samples)
-        errors[kind] = improved(form, windows, start, settings.decay, settings.iterations).error
+        errors[kind] = _simplest(linear, windows, settings)
     current = next(k for k, free in zip(now, open_kinds, strict=True) if free)
     least = min(errors, key=errors.__getitem__)
     return tried[least if errors[least] < _WORTH_A_KIND * errors[current] else current], errors
