@@ -372,10 +372,11 @@ def test_of_one_record_the_last_part_in_time_judges(tmp_path: Path) -> None:
     assert ranking.validation == (f"{run.name} after 26 s",)
     # The model knows nothing of what judged it: it is that of the first part alone.
     alone = fit([run.window(None, 26.0)], right.settings).model
-    assert ranking.best is not None and ranking.best.folder is not None
+    assert ranking.best is not None
+    assert ranking.best.folder is not None
     found, x = load(ranking.best.folder), np.array([0.3, -0.2])
     rates = (m.derivative(x, np.array([0.5]), np.array([1.0])) for m in (found, alone))
     np.testing.assert_allclose(*rates, rtol=1e-9)
+    short = run.window(2.0, 2.15)
     with pytest.raises(DfsmError, match="has 4 samples, too few to train with the first"):
-        short = run.window(2.0, 2.15)
         compare({"wrong": wrong, "right": right}, [short], tmp_path / "d", jobs=1)

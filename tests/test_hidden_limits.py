@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from benchmarks.twins import TWINS
 from dfsm.data.derivatives import StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, DfsmWarning
@@ -92,6 +93,27 @@ def test_runs_of_two_rates_are_refused_by_the_rates_that_there_are() -> None:
     runs = [decay((1.0, 0.0)), decay((0.0, 1.0), 0.2)]
     with pytest.raises(DfsmError, match=r"every 0.2 s has samples 0.2 s apart, where 0.1 s are"):
         fit(runs, SETTINGS)
+
+
+def test_what_is_nonlinear_is_not_taken_for_hidden_states() -> None:
+    """To a linear system a spring that hardens looks like two states more, with noise beside it."""
+    twin = TWINS["duffing"]
+    settings = FitSettings(
+        states=(StateSpec(name="y"),),
+        disturbances=("u",),
+        nonlinear_only=False,
+        hidden=HiddenSettings(form="polynomial", most=3),
+    )
+    # Nor is it told, by derivatives that are not to be fitted, that the input is held.
+    model = fit([twin.record(1000, 1, 0.01)], settings).model
+    told = model.provenance.record["hidden"]
+    assert told["by_count"]["3"] < 0.7 * told["by_count"]["1"]
+    assert told["count"] == 1
+    assert model.signals.between == ("cubic",)
+    test = twin.record(800, 2)
+    begin = float(test.time[50])
+    free = simulate(model, test, start=begin).trajectory
+    np.testing.assert_allclose(free["y"], test["y"][50:], atol=0.05 * test["y"].std())
 
 
 def test_the_last_steps_go_as_far_as_data_left_out_let_the_search_go() -> None:

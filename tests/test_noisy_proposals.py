@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.integrate import solve_ivp
 from dfsm.config.proposal import propose
 from dfsm.data.trajectory import Channel, Trajectory
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 Rate = Callable[[float, Array, float], Sequence[float]]
 
 
@@ -38,7 +39,7 @@ def record(
 ) -> Trajectory:
     """Input and first state, with white noise of so much of their spread, by a tight tolerance."""
     u, held = drive
-    tight = {"rtol": 1e-8, "atol": 1e-10}
+    tight: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
     if held:
         x = [np.array(start)]
         for a, b in pairwise(time):
