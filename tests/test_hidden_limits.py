@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -74,6 +76,23 @@ def test_more_hidden_states_than_the_data_tell_are_told() -> None:
         result = fit([driven(1)], settings)
     assert [*result.model.provenance.record["hidden"]["by_count"]] == ["2", "3", "4"]
     assert len(result.model.signals.latents) == 4
+
+
+def test_a_plant_that_grows_is_told_what_hidden_states_have_for_it() -> None:
+    """q'' = 0.04 q + u in open loop: linear.margin and refine do not go with hidden states."""
+    over = expm(np.array([[0.0, 1, 0], [0.04, 0, 1], [0, 0, 0]]) * 0.2)
+    u = np.random.default_rng(3).uniform(-1, 1, 24).repeat(5)
+    x, q = np.zeros(2), np.empty(len(u))
+    for k, v in enumerate(u):
+        q[k] = x[0]
+        x = over[:2, :2] @ x + over[:2, 2] * v
+    channels = (Channel("u", "N"), Channel("q", "m"))
+    time = 0.2 * np.arange(len(u))
+    run = Trajectory(time, np.stack([u, q], axis=1), channels, name="grows")
+    with pytest.warns(DfsmWarning, match=r"for any other set hidden.stable or fewer hidden states"):
+        model = fit([run], replace(SETTINGS, controls=("u",))).model
+    grows = np.linalg.eigvals(np.asarray(model.jacobians(np.zeros(2), np.zeros(1), [])[0])).real
+    np.testing.assert_allclose(grows.max(), 0.2, atol=0.01)
 
 
 def test_as_many_hidden_states_as_there_are_are_no_reason_to_doubt() -> None:

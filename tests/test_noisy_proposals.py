@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from dfsm.config.proposal import propose
+from dfsm.config.template import fill
 from dfsm.data.trajectory import Channel, Trajectory
 
 Array = NDArray[np.floating[Any]]
@@ -92,3 +93,14 @@ def test_a_spring_that_hardens_is_driven_by_a_smooth_input() -> None:
     assert proposed.hidden
     assert proposed.states == [{"name": "y", "order": 1}]
     assert proposed.disturbances == ["u"]
+
+
+def test_where_nothing_is_a_state_the_next_step_is_told() -> None:
+    """The configuration cannot be fitted as it stands."""
+    table = np.random.default_rng(0).standard_normal((500, 2))
+    channels = (Channel("a", "V"), Channel("b", "m"))
+    run = Trajectory(0.1 * np.arange(500), table, channels, name="noise")
+    text, told = fill([run], ["noise.csv"], "config.yaml")
+    assert "states: []" in text
+    assert told.startswith("No channel looks like a state")
+    assert "signals.states" in told
