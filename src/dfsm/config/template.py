@@ -189,8 +189,8 @@ def _hidden_told(proposed: Proposal) -> str:
 
 
 _NO_STATE = (
-    "No channel looks like a state: neither the others nor their past tell how one changes. Name in "
-    " signals.states what the model is to simulate, or add the channels that drive it"
+    "No channel looks like a state: neither the others nor their past tell how one changes. "
+    "Name in signals.states what the model is to simulate, or add the channels that drive it"
 )
 
 
