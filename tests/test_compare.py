@@ -24,6 +24,7 @@ from dfsm.data.derivatives import StateSpec
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import NoCorrection
 from dfsm.fitting.corrective.gaussian_process import GP
+from dfsm.fitting.fit import fit
 from dfsm.fitting.linear import LPV, LTI
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.model_folder import load
@@ -357,3 +358,25 @@ def test_the_example_of_the_template_holds(here):
     assert parse_config(Path("config.yaml")).compare.hold_out == 0.2
     _, found = parse_candidates("config.yaml")
     assert list(found) == ["base", "gp", "linear", "refined"]
+
+
+def test_of_one_record_the_last_part_in_time_judges(tmp_path: Path) -> None:
+    """The right structure wins on what comes after the record it was trained with."""
+    run = SCHEDULED.many(1, [(0, 1), (4, 4)], np.arange(0, 40.01, 0.05))[0]
+    right = replace(LINEAR, settings=replace(LINEAR.settings, linear=LTI(), start=2.0, stop=32.0))
+    lazy = StateSpec(name="q", order=1)
+    wrong = replace(right, settings=replace(right.settings, states=(lazy,)))
+    ranking = compare({"wrong": wrong, "right": right}, [run], tmp_path / "c", jobs=1)
+    assert [c.name for c in ranking.candidates] == ["right", "wrong"]
+    assert ranking.training == (f"{run.name} until 26 s",)
+    assert ranking.validation == (f"{run.name} after 26 s",)
+    # The model knows nothing of what judged it: it is that of the first part alone.
+    alone = fit([run.window(None, 26.0)], right.settings).model
+    assert ranking.best is not None
+    assert ranking.best.folder is not None
+    found, x = load(ranking.best.folder), np.array([0.3, -0.2])
+    rates = (m.derivative(x, np.array([0.5]), np.array([1.0])) for m in (found, alone))
+    np.testing.assert_allclose(*rates, rtol=1e-9)
+    short = run.window(2.0, 2.15)
+    with pytest.raises(DfsmError, match="has 4 samples, too few to train with the first"):
+        compare({"wrong": wrong, "right": right}, [short], tmp_path / "d", jobs=1)

@@ -124,7 +124,7 @@ def init(
     with working(quiet):
         told = write_config(files, output, step)
     if told:
-        say(f"{told}: the file proposes hidden: {{}} for states that nobody measures", quiet)
+        say(told, quiet)
     say(f"wrote {output}: check the signals, then run: dfsm fit {output} -o model/", quiet)
 
 

@@ -173,7 +173,7 @@ def fill(
         hidden=f"# {printable(advice)}\nhidden: {{}}\n" if advice else "",
         refine=_REFINE if turbine and long and len(runs) > 1 else "null",
     )
-    return text, advice
+    return text, advice if states else _NO_STATE
 
 
 def _hidden_told(proposed: Proposal) -> str:
@@ -182,7 +182,16 @@ def _hidden_told(proposed: Proposal) -> str:
         return ""
     left = ", ".join(f"{share:.0%} of that of {n}" for n, share in proposed.unexplained.items())
     why = f" (what is recorded leaves {left})" if left else ""
-    return f"Derivatives are not to be fitted here{why}: hidden fits rollouts instead"
+    return (
+        f"Derivatives are not to be fitted here{why}: hidden fits rollouts instead, with states "
+        "that nobody measures"
+    )
+
+
+_NO_STATE = (
+    "No channel looks like a state: neither the others nor their past tell how one changes. "
+    "Name in signals.states what the model is to simulate, or add the channels that drive it"
+)
 
 
 def _varies(values: Array) -> bool:

@@ -7,12 +7,14 @@ error says nothing of winds between them. With whole operating points left out i
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.data.dataset import Dataset
+from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, near_matches
 
 # Means of runs at one operating point lie closer than this share of the spread within a run.
@@ -57,6 +59,41 @@ def checked(hold_out: float | HoldOut, name: str) -> HoldOut:
         return hold_out
     require(0 < hold_out < 1, name, hold_out, "a share between 0 and 1")
     return HoldOut(share=hold_out)
+
+
+def in_time(
+    run: Trajectory, share: float, start: float | None = None, stop: float | None = None
+) -> tuple[Dataset, Dataset]:
+    """The first and the last part of one record.
+
+    Parameters
+    ----------
+    run
+        The record.
+    share
+        Of the time between `start` and `stop` that the last part takes.
+    start, stop
+        Window in s that is used.
+
+    Raises
+    ------
+    DfsmError
+        A record that is too short for the window, or for two parts.
+    """
+    used = run.window(start, stop)
+    at = round((1 - share) * (len(used) - 1))
+    if not 2 <= at < len(used) - 2:
+        raise DfsmError(
+            f"{run.where} has {len(used)} samples, too few to train with the first and judge by "
+            f"the last {share:.0%} of them: give more runs, or a longer one"
+        )
+    cut = float(used.time[at])
+    before, after = run.window(None, cut), used.window(float(used.time[at + 1]), None)
+    names = f"{run.name} until {cut:g} s", f"{run.name} after {cut:g} s"
+    return (
+        Dataset([replace(before, name=names[0])]),
+        Dataset([replace(after, name=names[1])]),
+    )
 
 
 def divisions(

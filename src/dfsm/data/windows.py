@@ -33,6 +33,9 @@ _NOISE, _KEPT, _LONGEST = 0.003, 0.9, 1024
 _COVERED = 0.5
 # Windows further from the median than so many usual distances, if few, are dropouts.
 _OFF, _FEW = 30.0, 0.01
+# Samples that tell whether noise moves a channel, and the share of the fitted effect below which it
+# does not.
+_TELLS, _NO_EFFECT = 100, 0.3
 # Orders of the differences that tell noise.
 _DIFFERENCES = (3, 5, 8)
 
@@ -84,6 +87,8 @@ class Windows:
         self.values = pooled[:: max(1, len(pooled) // _MOST_ROWS)]
         self.neighbours = self._runs[0].values[:_MOST_ROWS]
         self.noise = np.median([run.noise() for run in self._runs], axis=0)
+        # What is held has the value that it shows.
+        self._unsure = np.where(held, 0.0, self.noise)
         self._kept: dict[tuple[int, int], Rows] = {}
 
     def rows(self, order: int, span: int) -> Rows:
@@ -107,25 +112,33 @@ class Windows:
         """
         span = 1
         while True:
-            rows = self.rows(order, span)
-            if len(rows.change) < 4:
+            if len(self.rows(order, span).change) < 4:
                 return max(1, span // 2), 1.0
-            variance = np.var(rows.change[:, column])
-            weight = 2.0 if order == 1 else 6.0
-            own = weight * self.noise[column] ** 2 / (span * self.usual) ** (2 * order)
-            share = float(own / max(variance, own, np.finfo(float).tiny))
-            longer = self.rows(order, 2 * span).mean
-            kept = np.var(longer[:, column]) if len(longer) >= 4 else 0.0
-            motion = self.spread[column] ** 2 - self.noise[column] ** 2
-            short = kept < _KEPT * max(motion, _KEPT * self.spread[column] ** 2 / 2)
-            if share <= _NOISE or short or 2 * span > _LONGEST:
+            share = self._own_noise(column, order, span)
+            if share <= _NOISE or not self._may_grow(column, order, span):
                 return span, share
             span *= 2
+
+    def _own_noise(self, column: int, order: int, span: int) -> float:
+        """Share of the change of a channel that its noise is."""
+        variance = np.var(self.rows(order, span).change[:, column])
+        weight = 2.0 if order == 1 else 6.0
+        own = weight * self.noise[column] ** 2 / (span * self.usual) ** (2 * order)
+        return float(own / max(variance, own, np.finfo(float).tiny))
+
+    def _may_grow(self, column: int, order: int, span: int) -> bool:
+        """Whether windows twice as long hide next to nothing of a channel's own motion."""
+        longer = self.rows(order, 2 * span).mean
+        kept = np.var(longer[:, column]) if len(longer) >= 4 else 0.0
+        motion = self.spread[column] ** 2 - self.noise[column] ** 2
+        short = kept < _KEPT * max(motion, _KEPT * self.spread[column] ** 2 / 2)
+        return not (short or 2 * span > _LONGEST)
 
     def left(self, name: str, order: int, among: Sequence[str]) -> tuple[float, float]:
         """Share of the variance of a channel's derivative that a linear fit leaves.
 
-        Over the shortest windows over which noise is next to nothing, and without its share.
+        Over the shortest windows over which noise is next to nothing, and without its share: of
+        that in the channel itself, and of that in the others where it moves nothing.
 
         Parameters
         ----------
@@ -145,17 +158,57 @@ class Windows:
         span, noise = self.span(i, order)
         if noise > _COVERED:
             return 1.0, 1.0
-        rows = self.rows(order, span)
-        target = rows.change[:, i]
-        good = without_dropouts(target)
         columns = [self.names.index(n) for n in dict.fromkeys((name, *among))]
-        every, own = rows.mean[good][:, columns], rows.mean[good][:, [i]]
+        shares, others = self._shares(i, order, span, columns)
+        silent = others > _NOISE and self._silent(i, order, columns)
+        while silent and others > _NOISE and self._may_grow(i, order, span):
+            span *= 2
+            noise = self._own_noise(i, order, span)
+            shares, others = self._shares(i, order, span, columns)
+        left = _without(shares[0], noise + (others if silent else 0.0))
+        return left, _without(shares[1], noise)
+
+    def _shares(
+        self, column: int, order: int, span: int, columns: Sequence[int]
+    ) -> tuple[tuple[float, float], float]:
+        """What is left by some channels and by the first of them; what noise of the others makes.
+
+        All relative to the variance of the change.
+        """
+        rows = self.rows(order, span)
+        target = rows.change[:, column]
+        good = without_dropouts(target)
+        target, every, own = target[good], rows.mean[good][:, columns], rows.mean[good][:, [column]]
         if order == 2:
             # Of the rates, its own: that of an input is none that it acts by.
-            every, own = (np.column_stack([part, rows.slope[good, i]]) for part in (every, own))
-        shares = left_of(target[good], every), left_of(target[good], own)
-        left, alone = (max(0.0, share - noise) / (1 - noise) for share in shares)
-        return left, alone
+            slope = rows.slope[good, column]
+            every, own = (np.column_stack([part, slope]) for part in (every, own))
+        total = max(float(np.var(target)), np.finfo(float).tiny)
+        # White noise in a mean between samples, under a box and under a hat.
+        mean = (1 - 1 / (2 * span)) / span if order == 1 else 2 * (1 - 1 / (4 * span)) / (3 * span)
+        acts = fitted(target, every)[1 : len(columns)]
+        passed = float(np.sum((acts * self._unsure[list(columns[1:])]) ** 2)) * mean / total
+        return (left_of(target, every), left_of(target, own)), passed
+
+    def _silent(self, column: int, order: int, columns: Sequence[int]) -> bool:
+        """Whether a derivative does not follow what changes from sample to sample in the others.
+
+        Noise of a sensor moves nothing; a signal that is truly rough does.
+        """
+        change, _, mean = self._runs[0].rows(order, 1, 1)
+        others = [c for c in columns[1:] if self._unsure[c] > 0]
+        if not others:
+            return False
+        turns = np.diff(mean[:, others], 2, axis=0)
+        # Of jumps the derivative follows with all the rest: the quieter half is between them.
+        size = np.max(np.abs(turns) / np.maximum(turns.std(axis=0), np.finfo(float).tiny), axis=1)
+        quiet = size <= np.median(size)
+        if np.sum(quiet) < _TELLS:
+            return False
+        slow = fitted(change[:, column], mean[:, [column, *others]])[1:]
+        fast = fitted(np.diff(change[:, column], 2)[quiet], turns[quiet])
+        power = self._unsure[others] ** 2
+        return bool(np.sum(power * fast**2) < _NO_EFFECT**2 * np.sum(power * slow**2))
 
 
 class _Run:
@@ -232,14 +285,26 @@ def without_dropouts(target: Array) -> NDArray[np.bool_]:
     return good
 
 
+def fitted(target: Array, inputs: Array) -> Array:
+    """Coefficients of a linear fit, ``(input,)``."""
+    X, y = inputs - inputs.mean(axis=0), target - target.mean()
+    size = np.maximum(X.std(axis=0), np.finfo(float).tiny)
+    X = X / size
+    return np.linalg.lstsq(X.T @ X, X.T @ y, rcond=1e-12)[0] / size
+
+
 def rest_of(target: Array, inputs: Array) -> Array:
     """What a linear fit leaves of a target."""
     X, y = inputs - inputs.mean(axis=0), target - target.mean()
-    X = X / np.maximum(X.std(axis=0), np.finfo(float).tiny)
-    return y - X @ np.linalg.lstsq(X.T @ X, X.T @ y, rcond=1e-12)[0]
+    return y - X @ fitted(target, inputs)
 
 
 def left_of(target: Array, inputs: Array) -> float:
     """Share of a variance that a linear fit leaves; all of what does not vary."""
     total = float(np.var(target))
     return float(np.mean(rest_of(target, inputs) ** 2)) / total if total > 0 else 1.0
+
+
+def _without(share: float, noise: float) -> float:
+    """What is left of a share of a variance, of which noise is another."""
+    return max(0.0, share - noise) / (1 - noise) if noise < 1 else 0.0

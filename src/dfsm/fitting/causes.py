@@ -3,6 +3,7 @@
 Granger 1969, "Investigating causal relations by econometric models and cross-spectral methods": a
 channel is driven where the past of the others, beside its own, makes its next sample much better
 known. An input of an open loop, however smooth, is not; a hidden state in between does not matter.
+What a response tells of an input is more of that input's own past: its own reaches further back.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.numerics.folds import unfolded
 
-# Samples of the past, samples looked at, and channels beyond which it is not tried.
-_PAST, _MOST_SAMPLES, _MOST_CHANNELS = 10, 20_000, 12
+# Samples of the past of others and of a channel's own, samples looked at, and channels beyond which
+# it is not tried.
+_PAST, _OWN, _MOST_SAMPLES, _MOST_CHANNELS = 10, 30, 20_000, 12
 # Samples looked at where only the size of a gain counts.
 _GAINED = 4000
 # Samples looked at where signs are to be found first.
@@ -79,8 +81,8 @@ def _driven(table: Array, names: Sequence[str]) -> list[str]:
     past = _lags(table)
     if past < 2:
         return []
-    gains, rows = _gains(table, past)
-    counted = gains * (rows - past * len(names)) / (past * (len(names) - 1)) > _COUNTS
+    gains, free = _gains(table, past)
+    counted = gains * free / (past * (len(names) - 1)) > _COUNTS
     driven = counted & (gains >= _SHARE * gains.max())
     if not driven.any() or driven.all():
         return []
@@ -88,22 +90,26 @@ def _driven(table: Array, names: Sequence[str]) -> list[str]:
 
 
 def _lags(table: Array) -> int:
-    """Samples of the past that a table can tell of."""
+    """Samples of the past of all channels that a table can tell of."""
     return min(_PAST, len(table) // (10 * max(1, table.shape[1])))
 
 
 def _gains(table: Array, past: int) -> tuple[Array, int]:
-    """Gains of all channels, and the samples that they are judged on."""
+    """Gains of all channels, and the degrees of freedom that they are judged with."""
     table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), np.finfo(float).tiny)
-    lags = np.stack([table[past - k - 1 : len(table) - k - 1] for k in range(past)], axis=1)
-    return np.array([_gain(lags, table[past:], i) for i in range(table.shape[1])]), len(lags)
+    others = past * (table.shape[1] - 1)
+    own = max(past, min(_OWN, len(table) // 10 - others))
+    lags = np.stack([table[own - k - 1 : len(table) - k - 1] for k in range(own)], axis=1)
+    gains = [_gain(lags, table[own:], i, past) for i in range(table.shape[1])]
+    return np.array(gains), len(lags) - own - others
 
 
-def _gain(lags: Array, now: Array, column: int) -> float:
+def _gain(lags: Array, now: Array, column: int, past: int) -> float:
     """By how much its own past alone leaves more of a channel than with the past of the others."""
-    own = _left(lags[:, :, [column]].reshape(len(lags), -1), now[:, column])
-    every = _left(lags.reshape(len(lags), -1), now[:, column])
-    return own / every - 1
+    own = lags[:, :, column]
+    others = np.delete(lags[:, :past], column, axis=2).reshape(len(lags), -1)
+    every = np.concatenate([own, others], axis=1)
+    return _left(own, now[:, column]) / _left(every, now[:, column]) - 1
 
 
 def _left(past: Array, now: Array) -> float:

@@ -57,9 +57,11 @@ def check(
     grows = None if held else _grows_itself(model, growing, doubt)
     if unstable := [g for g in growing if g.unstable]:
         what = "linear fit" if model.e is None else "model"
+        # A margin of the linear fit means nothing to what rollouts taught.
+        way = "linear.margin" if settings.hidden is None else "hidden.stable or fewer hidden states"
         cure = (
-            "right for an unstable system; for any other set linear.margin, or expect rollouts to "
-            "drift off"
+            f"right for an unstable system; for any other set {way}, or expect rollouts to drift "
+            "off"
         )
         if not doubt.cured_by_margin:
             cure = "what is told of its inputs may be why, and is to be mended first"

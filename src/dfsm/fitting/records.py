@@ -60,9 +60,12 @@ def _held_states(data: Dataset, settings: FitSettings) -> dict[str, str]:
 
 
 def _held_inputs(data: Dataset, settings: FitSettings, samples: Samples) -> dict[str, str]:
-    """Inputs that are taken for lines by nobody's choice, and act as held ones."""
+    """Inputs that are taken for lines by nobody's choice, and act as held ones.
+
+    With hidden states what is recorded is no whole state; the search finds out what inputs do.
+    """
     chosen = settings.inputs or {}
-    if isinstance(chosen, str) or samples.weights is not None:
+    if isinstance(chosen, str) or samples.weights is not None or settings.hidden is not None:
         return {}
     names = samples.signals.driving
     states = [n for s in settings.states for n in (s.name, s.rate) if n is not None]

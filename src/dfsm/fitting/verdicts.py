@@ -140,6 +140,8 @@ def _advice(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, 
             f"{2 / evidence.grows:.2g} s each; a margin would only spoil it",
         )
     unstable = any(g.unstable for g in evidence.growths)
+    if unstable and settings.hidden is not None:
+        return ", and the model is unstable", "fewer hidden states (hidden.count), or hidden.stable"
     if unstable and settings.linear.margin is None:
         return ", and the model is unstable", "linear.margin, or refine"
     if not evidence.refined and name not in settings.outputs:

@@ -282,6 +282,8 @@ def uneven(times: Sequence[Series]) -> tuple[float, int | None]:
     tuple of float and int
         None instead of an index where all samples are that interval apart.
     """
-    step = float(np.median(np.concatenate([np.diff(time) for time in times])))
+    every = np.concatenate([np.diff(time) for time in times])
+    # One that there is, not the mean of two.
+    step = float(np.quantile(every, 0.5, method="lower"))
     off = (np.abs(np.diff(time) - step).max() > _UNEVEN * step for time in times)
     return step, next((i for i, other in enumerate(off) if other), None)

@@ -31,7 +31,7 @@ from dfsm.core.settings import require
 from dfsm.core.workers import default_jobs, work_through
 from dfsm.data.dataset import Dataset
 from dfsm.data.derivatives import state_names
-from dfsm.data.hold_out import HoldOut, checked, divisions
+from dfsm.data.hold_out import HoldOut, checked, divisions, in_time
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.dfsm import DFSM
@@ -184,7 +184,8 @@ def compare(
         of `runs`.
     hold_out
         Share of the runs that is held out where there is no `validation`, at least one; or a
-        `HoldOut` of one split, which leaves out whole operating points.
+        `HoldOut` of one split, which leaves out whole operating points. Of one run it is the
+        share that is last in time.
     jobs
         Number of processes; None takes half the processors. With one, all is done in this one.
 
@@ -195,7 +196,7 @@ def compare(
     Raises
     ------
     DfsmError
-        Candidates that cannot be compared, fewer than two runs, or a folder that cannot be used.
+        Candidates that cannot be compared, too short a single run, or a folder that cannot be used.
         A candidate that cannot be fitted is listed with its reason instead.
     """
     states = check_candidates(candidates)
@@ -313,6 +314,8 @@ def _shares(
         together = [n for n in settings.disturbances if n in data.names]
         how = checked(hold_out, "hold_out")
         require(how.splits == 1, "hold_out.splits", how.splits, "1: candidates are ranked on one")
+        if len(data) == 1 and how.by is None:
+            return in_time(data[0], how.share, settings.start, settings.stop)
         return divisions(data, how, settings.seed, together, settings.start, settings.stop)[0]
     judged = Dataset(validation)
     digests = {run.digest for run in judged}

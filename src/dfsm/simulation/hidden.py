@@ -142,7 +142,7 @@ class _Past:
         driven = window.select(s.exogenous).require_finite()
         every = mesh_of(driven, s.step, s.between_samples()).every
         begin, middle, end = (
-            part.reshape(-1, part.shape[-1])
+            part.reshape(int(np.prod(part.shape[:-1])), part.shape[-1])
             for part in stages_of(driven, s.between_samples(), every)
         )
         names = (*s.names("observed"), *s.telling)

@@ -23,7 +23,7 @@ from dfsm.numerics.time_mesh import uneven
 _STARTUP, _FEWEST = 50, 20
 # A measured state that is another one late, to so small a share of its variance.
 _DELAYED, _LAGS = 1e-6, 50
-# Of what a further hidden state must gain to be no more than the data can tell.
+# Of what fewer hidden states leave, what more must come below to be no more than the data can tell.
 _NOTHING = 0.98
 
 
@@ -132,8 +132,9 @@ def _require_even(records: list[Trajectory]) -> None:
     step, other = uneven([record.time for record in records])
     if other is not None:
         apart = np.diff(records[other].time)
+        ends = dict.fromkeys(f"{end:.6g}" for end in (apart.min(), apart.max()))
         raise DfsmError(
-            f"{records[other].where} has samples {apart.min():.6g} to {apart.max():.6g} s apart, "
+            f"{records[other].where} has samples {' to '.join(ends)} s apart, "
             f"where {step:.6g} s are usual: hidden states are fitted on even samples of one "
             "interval in all runs, so resample it, or leave it out"
         )
@@ -225,15 +226,14 @@ def _degree(form: Form) -> int:
 
 
 def _doubts(found: Found, hidden: HiddenSettings) -> list[str]:
-    """More hidden states than the data tell apart, and what the last one gained."""
-    form = found.best.form
-    count = form.states - form.outputs
-    fewer = [(c, e) for _, c, e in found.tried if c == count - 1]
-    if hidden.count is None or not fewer or found.best.error < _NOTHING * min(e for _, e in fewer):
+    """More hidden states than the data tell apart."""
+    count = found.best.form.states - found.best.form.outputs
+    fewer = {c: e for c, e in found.gains.items() if c < count}
+    if hidden.count is None or not fewer or found.best.error < _NOTHING * min(fewer.values()):
         return []
-    least = min(e for _, e in fewer)
+    enough = min(c for c, e in fewer.items() if _NOTHING * e <= found.best.error)
     return [
-        f"hidden.count is {count}, more than the data can tell: with {count - 1} rollouts are off "
-        f"by {np.sqrt(least):.3g} standard deviations where data were left out, with {count} by "
-        f"{np.sqrt(found.best.error):.3g}; set hidden.count to {count - 1}, or to null"
+        f"hidden.count is {count}, more than the data can tell: a linear equation with {enough} is "
+        f"off by {np.sqrt(fewer[enough]):.3g} standard deviations where data were left out, this "
+        f"one by {np.sqrt(found.best.error):.3g}; set hidden.count to {enough}, or to null"
     ]

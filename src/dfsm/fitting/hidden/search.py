@@ -47,7 +47,8 @@ _SCOUTS = 4
 _MOST_MONOMIALS = 60
 # Polynomials go on to so many times what was recorded.
 _BEYOND = 1.5
-# Steps to follow a change of the integration, and to learn from all of many data at last.
+# Steps to follow a change of the integration, and to learn from all data at last: the fewest, and
+# all there are where data are many.
 _FOLLOW, _LAST = 8, 5
 # Samples that tell the state at the start of a window.
 _HEAD = 100
@@ -116,12 +117,16 @@ def search(
     windows = windows_of(records, standard, kinds, 1, settings.samples)
     linear = _behind(records, standard, (kinds, windows), settings)
     gains = {c: candidate.error for c, candidate in linear.items()}
-    first = _promising(linear)[0]
+    if settings.count is not None:
+        linear = {settings.count: linear[settings.count]}
+    counts = _promising(linear, windows, settings)
+    linear = {c: linear[c] for c in counts}
     kinds, kinds_tried = _interpolation(
-        records, standard, linear[first], (kinds, open_kinds), settings
+        records, standard, linear[counts[0]], (kinds, open_kinds), settings
     )
     windows = windows_of(records, standard, kinds, 1, settings.samples)
     best, tried = _ascended(linear, windows, settings, seed)
+    further = last_steps(best, settings.iterations)
     best, steps = _steps(records, standard, best, kinds, settings)
     everything = windows_of(records, standard, kinds, steps).with_all()
     error = best.error
@@ -129,7 +134,7 @@ def search(
         best, windows_of(records, standard, kinds, steps, settings.samples), everything
     )
     few = everything.used.sum() <= settings.samples
-    last = settings.iterations if few else _LAST
+    last = further if few else _LAST
     final = improved(best.form, everything, weights, settings.decay, last)
     final = replace(final, error=error)
     return Found(final, standard, kinds, steps, everything, gains, tried, kinds_tried)
@@ -161,7 +166,10 @@ def _linear(
 ) -> dict[int, Candidate]:
     """Linear systems by the number of hidden states."""
     ny, nv = len(standard.outputs[0]), len(standard.inputs[0])
-    counts = range(settings.most + 1) if settings.count is None else [settings.count]
+    counts: Sequence[int] = range(settings.most + 1)
+    if settings.count is not None:
+        # Fewer tell whether there are too many.
+        counts = sorted({settings.count // 2, max(0, settings.count - 1), settings.count})
     found = subspace(told.records, standard, ny + max(counts))
     room, (unfolded, seen) = ny + max(counts), windows
     each = [linear_start(found, Form(ny + c, ny, nv, room=room), unfolded) for c in counts]
@@ -173,11 +181,33 @@ def _linear(
     return dict(zip(counts, each, strict=True))
 
 
-def _promising(linear: dict[int, Candidate]) -> list[int]:
-    """Numbers of hidden states from the least that a linear system is nearly as good with."""
-    least = min(c.error for c in linear.values())
-    first = min(c for c in linear if linear[c].error <= _NEARLY * least)
-    return [c for c in sorted(linear) if c >= first and np.isfinite(linear[c].error)]
+def _promising(
+    linear: dict[int, Candidate], windows: Windows, settings: HiddenSettings
+) -> list[int]:
+    """Numbers of hidden states to try, from the fewest that may be enough.
+
+    A linear system takes what is nonlinear for further states. So where one with more is far
+    better, the simplest nonlinear start is asked whether fewer do.
+    """
+    known = [c for c in sorted(linear) if np.isfinite(linear[c].error)]
+    least = min(linear[c].error for c in known)
+    first = next(c for c in known if linear[c].error <= _NEARLY * least)
+    fewer = [c for c in reversed(known) if c < first]
+    if fewer and settings.form != "none":
+        least = _simplest(linear[first], windows, settings)
+        for count in fewer:
+            error = _simplest(linear[count], windows, settings)
+            if not error <= _NEARLY * least:
+                break
+            first, least = count, min(least, error)
+    return [c for c in known if c >= first]
+
+
+def _simplest(linear: Candidate, windows: Windows, settings: HiddenSettings) -> float:
+    """Squared error on data left out of the simplest nonlinear start there is."""
+    form = _forms(linear.form, windows, settings, 0)[0][0]
+    start = nonlinear_start(linear, form, 0)
+    return improved(form, windows, start, settings.decay, settings.iterations).error
 
 
 def _ascended(
@@ -189,7 +219,7 @@ def _ascended(
     Few draws tell how many there are, and whether the others are worth drawing.
     """
     best, others, tried = None, None, []
-    for count in _promising(linear):
+    for count in linear:
         tasks = _forms(linear[count].form, windows, settings, seed)
         candidates = list(_nonlinear(linear[count], windows, settings, tasks[:_SCOUTS]))
         tried += [(c.form.kind, count, c.error) for c in candidates]
@@ -262,16 +292,13 @@ def _interpolation(
     now, open_kinds = kinds
     if not any(open_kinds):
         return now, {}
-    at_hand = windows_of(records, standard, now, 1, settings.samples)
-    form = _forms(linear.form, at_hand, settings, 0)[0][0]
-    start = nonlinear_start(linear, form, 0)
     tried: dict[str, tuple[Between, ...]] = {}
     errors: dict[str, float] = {}
     for kind in get_args(Between):
         pairs = zip(now, open_kinds, strict=True)
         tried[kind] = tuple(kind if free else k for k, free in pairs)
         windows = windows_of(records, standard, tried[kind], 1, settings.samples)
-        errors[kind] = improved(form, windows, start, settings.decay, settings.iterations).error
+        errors[kind] = _simplest(linear, windows, settings)
     current = next(k for k, free in zip(now, open_kinds, strict=True) if free)
     least = min(errors, key=errors.__getitem__)
     return tried[least if errors[least] < _WORTH_A_KIND * errors[current] else current], errors
@@ -297,6 +324,17 @@ def _steps(
         steps *= 2
         best = improved(best.form, finer, best.weights, settings.decay, _FOLLOW)
     return best, steps
+
+
+def last_steps(best: Candidate, limit: int) -> int:
+    """Steps on all data: where data left out ended a search early, nothing else tells when to end.
+
+    As far as these let the search go in its second half, so are the last steps of all there may be.
+    A linear system, or a search that came to its end, is followed to the end.
+    """
+    if best.form.kind == "none" or not best.steps:
+        return limit
+    return min(limit, max(_LAST, 2 * best.steps - limit))
 
 
 def _restarted(best: Candidate, few: Windows, everything: Windows) -> Array:
