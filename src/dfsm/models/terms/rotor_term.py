@@ -53,8 +53,8 @@ class RotorConstants:
         Whether there is a surge rate.
     overhang, lead, lean, drifts
         How far upwind the rotor stands in m, None where it is taken to stand where the wind is
-        told; by how many seconds the wind ahead is; what one unit of platform pitch carries it downwind in m, None without that signal;
-        and whether there is a surge.
+        told; by how many seconds the wind ahead is; what one unit of platform pitch carries it
+        downwind in m, None without that signal; and whether there is a surge.
     ratios, angles
         First and last tip speed ratio and pitch in deg of the table.
     optimum
