@@ -40,7 +40,7 @@ def run() -> dict[str, Any]:
     tests = {label: turbine.with_rings(runs) for label, runs in tests.items()}
     plain = uncorrected()
     bare = {"corrective": dfsm.NoCorrection(), "corrected": None, "outputs": ()}
-    nowhere = {"overhang": None, "lead": None, "platform_pitch": None}
+    nowhere = {"overhang": None, "wind_rate": None, "platform_pitch": None}
 
     def with_rotor(settings: dfsm.FitSettings, **changes: Any) -> dfsm.FitSettings:
         terms = (replace(term, **changes) for term in settings.terms)

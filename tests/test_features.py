@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from dfsm.data.derivatives import StateSpec
-from dfsm.data.features import Feature, with_features
+from dfsm.data.features import Feature, unknown_ends, with_features
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.corrective import NoCorrection
@@ -242,6 +242,19 @@ def test_a_lead_is_what_comes(tmp_path):
     assert simulate(loaded, run, stop=20).guessed == (0, 0)
     (told,) = validate(loaded, [run]).warnings
     assert "compared up to 28.5 s" in told
+
+
+def test_a_rate_over_some_seconds_is_a_slope_between_two_samples():
+    run = led(1)
+    rate = Feature(source="w", kind="rate", seconds=1.0)
+    assert rate.name == "w_dot1"
+    made = with_features(run, [rate])
+    assert made.channel("w_dot1").unit == "m/s"
+    slope = (run["w"][40:] - run["w"][:-40]) / 2
+    np.testing.assert_allclose(made["w_dot1"][20:-20], slope, atol=1e-12)
+    assert unknown_ends([rate]) == (1.0, 1.0)
+    with pytest.raises(DfsmError, match=r"features\.seconds is -1\.0, expected a positive number"):
+        Feature(source="w", kind="rate", seconds=-1.0)
 
 
 def test_what_a_lead_does_not_know_is_left_out_of_a_fit():

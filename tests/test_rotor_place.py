@@ -12,13 +12,13 @@ from numpy.testing import assert_allclose
 
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
-from dfsm.models.terms.rotor_place import share_ahead
+from dfsm.models.terms.rotor_place import lead_time
 from dfsm.models.terms.rotor_term import RotorTerm
 from rotors import rotor
 
 UNITS = {
     "Wind": "m/s",
-    "Wind_lead2": "m/s",
+    "Wind_dot": "m/s^2",
     "Speed": "rpm",
     "Pitch": "deg",
     "Lean": "deg",
@@ -33,7 +33,7 @@ PLACE = {
     "hub_height": 150.0,
     "pitch_rate": "LeanRate",
     "overhang": 12.0,
-    "lead": 2.0,
+    "wind_rate": "Wind_dot",
     "platform_pitch": "Lean",
     "surge": "Drift",
     "corrections": ("Gust",),
@@ -46,7 +46,7 @@ def term(**changes) -> RotorTerm:
 
 
 def inputs(count: int) -> np.ndarray:
-    low, high = [4, 4, 2, 0, -3, -0.5, -10, -1, 0], [25, 25, 9, 25, 8, 0.5, 15, 1, 0]
+    low, high = [4, -0.3, 2, 0, -3, -0.5, -10, -1, 0], [25, 0.3, 9, 25, 8, 0.5, 15, 1, 0]
     return RNG.uniform(low, high, (count, len(UNITS)))
 
 
@@ -57,24 +57,24 @@ def test_the_wind_is_met_where_the_rotor_stands():
     wind = mean + 1.2 * np.sin(omega * time)
     rows = np.zeros((len(time), len(UNITS)))
     rows[:, COLUMNS["Wind"]], rows[:, COLUMNS["Speed"]] = wind, 6.0
-    rows[:, COLUMNS["Wind_lead2"]] = mean + 1.2 * np.sin(omega * (time + 2))
+    rows[:, COLUMNS["Wind_dot"]] = 1.2 * omega * np.cos(omega * time)
     rows[:, COLUMNS["Lean"]], rows[:, COLUMNS["Drift"]] = lean, drift
     one = term()
     at = np.array(one.columns)
     (found, *_) = one.inflow(jnp.asarray(rows[:, at]))
     tau = (overhang - 150 * np.deg2rad(lean) - drift) / mean
     met = mean + 1.2 * np.sin(omega * (time + tau))
-    # As far as the wind is its mean.
+    # To second order in ωτ, and as far as the wind is its mean.
     assert np.abs(found - met).max() < 0.2 * np.abs(wind - met).max()
 
 
-def test_the_share_of_the_wind_ahead_is_bounded_and_smooth():
+def test_a_lead_is_bounded_and_smooth():
     distance = jnp.linspace(-400, 400, 101)
-    calm, strong = (share_ahead(distance, jnp.asarray(v), 2.0) for v in (0.0, 20.0))
-    assert np.abs(calm).max() <= 3.0
+    calm, strong = lead_time(distance, jnp.zeros(())), lead_time(distance, jnp.asarray(20.0))
+    assert np.abs(calm).max() <= 6.0
     near = np.abs(distance) < 20
-    assert_allclose(strong[near], distance[near] / 40, rtol=0.02, atol=1e-12)
-    slopes = jax.vmap(jax.grad(lambda d: share_ahead(d, jnp.asarray(5.0), 2.0)))(distance)
+    assert_allclose(strong[near], distance[near] / 20, rtol=0.02, atol=1e-12)
+    slopes = jax.vmap(jax.grad(lambda d: lead_time(d, jnp.asarray(5.0))))(distance)
     assert (np.asarray(slopes) > 0).all()
 
 
@@ -88,7 +88,7 @@ def test_stages_folders_and_slopes_know_of_it(without):
     ready = one.staged()
     assert_allclose(jax.vmap(lambda row: ready.of_numbers(list(row)))(signals), expected, rtol=1e-9)
 
-    still = term(overhang=None, lead=None, platform_pitch=None, surge=None)
+    still = term(overhang=None, wind_rate=None, platform_pitch=None, surge=None)
     rest = jnp.asarray(inputs(40)[:, np.array(still.columns)])
     assert np.abs(np.asarray(jax.vmap(still.values)(rest)) - expected).max() > 1.0
 
@@ -99,9 +99,9 @@ def test_stages_folders_and_slopes_know_of_it(without):
 
 
 def test_a_model_made_before_stands_where_the_wind_is_told():
-    one = term(overhang=None, lead=None, platform_pitch=None, surge=None)
+    one = term(overhang=None, wind_rate=None, platform_pitch=None, surge=None)
     told = one.structure()
-    for key in ("overhang", "lead", "lean", "drifts"):
+    for key in ("overhang", "lean", "drifts"):
         del told["about"][key]
     again = RotorTerm.restored(one.columns, one.channels, one.arrays(), told)
     assert again.about == one.about
@@ -111,18 +111,17 @@ def test_a_model_made_before_stands_where_the_wind_is_told():
     ("changes", "message"),
     [
         ({"overhang": float("inf")}, "rotor.overhang is inf, expected a number of m"),
-        ({"lead": 0.0}, "rotor.lead is 0.0, expected a positive number of s"),
-        ({"lead": None}, "rotor.overhang is 12.0 without rotor.lead"),
-        ({"overhang": None}, "rotor.lead is 2.0 without rotor.overhang"),
+        ({"wind_rate": None}, "rotor.overhang is 12.0 without rotor.wind_rate"),
+        ({"overhang": None}, "rotor.wind_rate is Wind_dot without rotor.overhang"),
         (
-            {"overhang": None, "lead": None},
-            "rotor.platform_pitch is 'Lean' without rotor.overhang and rotor.lead",
+            {"overhang": None, "wind_rate": None},
+            "rotor.platform_pitch is 'Lean' without rotor.overhang and rotor.wind_rate",
         ),
-        ({"lead": 3.0}, "add the feature {source: Wind, kind: lead, seconds: 3}"),
         (
             {"hub_height": None, "pitch_rate": None},
             "rotor.platform_pitch is 'Lean' without rotor.hub_height",
         ),
+        ({"wind_rate": "Beam"}, "its wind_rate 'Beam' is in 'kN', expected m/s^2"),
         ({"surge": "Beam"}, "its surge 'Beam' is in 'kN', expected m"),
         ({"platform_pitch": "Beam"}, "its platform_pitch 'Beam' is in 'kN', expected rad or deg"),
     ],

@@ -42,8 +42,8 @@ RINGS = ("U_r015", "U_r036", "U_r057", "U_r078", "U_r099", "U_r116", "U_cubic")
 AHEAD = tuple(dfsm.Feature(source="Wave1Elev", kind="lead", seconds=s) for s in (2.0, 4.0, 6.0))
 # The middle of the blades, three quarters out, is upwind of the hub by their cone of 4 deg: in m.
 OVERHANG = 12.03 + 0.75 * 120.97 * math.sin(math.radians(4))
-# The wind that it meets by then, where it blows with 6 to 9 m/s.
-ARRIVING = dfsm.Feature(source="RotWind", kind="lead", seconds=2.0)
+# The wind's rate, by which it meets the wind earlier; over two seconds, for nothing faster counts.
+GUSTS = dfsm.Feature(source="RotWind", kind="rate", seconds=1.0)
 # What moves the platform besides the rotor, by the equation of motion in pitch.
 HYDRODYNAMICS = (
     *("PtfmPitch", "PtfmPitch_dot", "Wave1Elev", "Wave1Elev_dot"),
@@ -62,7 +62,7 @@ def rotor(rings: Sequence[str] = RINGS) -> dfsm.Rotor:
         hub_height=HUB_HEIGHT,
         pitch_rate="PtfmPitch_dot",
         overhang=OVERHANG,
-        lead=ARRIVING.seconds,
+        wind_rate=GUSTS.name,
         platform_pitch="PtfmPitch",
         corrections=tuple(f"{ring}-RotWind" for ring in rings),
         inertia=318.6e6,  # with the generator
@@ -90,7 +90,7 @@ def settings(
         controls=CONTROLS,
         disturbances=DISTURBANCES,
         features=(
-            ARRIVING,
+            GUSTS,
             dfsm.Feature(source="Wave1Elev"),
             *ahead,
             *excess,

@@ -38,20 +38,21 @@ class Feature:
         The disturbance that it is computed from.
     kind
         ``"rate"``: the time derivative, by the same smoothing spline as derivatives of states;
-        named ``<source>_dot``. ``"lag"``: a first-order lag, ``τ dz/dt = source - z``, at rest when
-        the record starts; named ``<source>_lag<τ>``. ``"difference"``: source less another
-        disturbance in the same unit, e.g. the wind over a ring of the rotor less that over the
-        disk; named ``<source>-<less>``. ``"delay"``: the source so many seconds ago, as it was at
-        first where the record does not go back so far; named ``<source>_delay<seconds>``. Only for
-        a delay the source may be a control; a model with one cannot be optimized. ``"lead"``: the
-        source in so many seconds, as it is at last where the record ends before; named
-        ``<source>_lead<seconds>``. Waves reach a hull before they reach the point where their
-        elevation is told, so that their force begins before it (Falnes 1995, Applied Ocean Research
-        17, 379-386).
+        named ``<source>_dot``; with `seconds` the slope from so many before to so many after, which
+        is smoother, named ``<source>_dot<seconds>``. ``"lag"``: a first-order lag,
+        ``τ dz/dt = source - z``, at rest when the record starts; named ``<source>_lag<τ>``.
+        ``"difference"``: source less another disturbance in the same unit, e.g. the wind over a
+        ring of the rotor less that over the disk; named ``<source>-<less>``. ``"delay"``: the
+        source so many seconds ago, as it was at first where the record does not go back so far;
+        named ``<source>_delay<seconds>``. Only for a delay the source may be a control; a model
+        with one cannot be optimized. ``"lead"``: the source in so many seconds, as it is at last
+        where the record ends before; named ``<source>_lead<seconds>``. Waves reach a hull before
+        they reach the point where their elevation is told, so that their force begins before it
+        (Falnes 1995, Applied Ocean Research 17, 379-386).
     time_constant
         τ of a lag in s.
     seconds
-        How late a delay is, how early a lead.
+        How late a delay is, how early a lead, and what a rate spans on either side.
     less
         What a difference takes off.
     """
@@ -63,9 +64,9 @@ class Feature:
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        for key, kinds in (("time_constant", ("lag",)), ("seconds", ("delay", "lead"))):
+        for key, kinds in (("time_constant", ("lag",)), ("seconds", ("delay", "lead", "rate"))):
             value: float | None = getattr(self, key)
-            if self.kind in kinds:
+            if self.kind in kinds and not (self.kind == "rate" and value is None):
                 positive = value is not None and bool(np.isfinite(value)) and value > 0
                 require(positive, f"features.{key}", value, "a positive number of seconds")
             else:
@@ -83,7 +84,7 @@ class Feature:
     def name(self) -> str:
         """Name of the channel."""
         if self.kind == "rate":
-            return f"{self.source}_dot"
+            return f"{self.source}_dot" + ("" if self.seconds is None else f"{self.seconds:g}")
         if self.kind == "difference":
             return f"{self.source}-{self.less}"
         if self.kind in ("delay", "lead"):
@@ -117,7 +118,8 @@ def with_features(run: Trajectory, features: Iterable[Feature]) -> Trajectory:
         made = _made_of(run, feature, added)
         source, *others = made.channels
         if feature.kind == "rate":
-            values, unit = _rate(made, feature), per_second(source.unit)
+            span, unit = feature.seconds, per_second(source.unit)
+            values = _rate(made, feature) if span is None else _slope_over(made, source.name, span)
         elif feature.kind == "lag":
             values, unit = _lagged(made, feature), source.unit
         elif feature.seconds is not None:
@@ -158,7 +160,7 @@ def unknown_ends(features: Iterable[Feature]) -> tuple[float, float]:
     for feature in features:
         for known, kind in ((late, "delay"), (early, "lead")):
             before = max(known.get(source, 0.0) for source in feature.sources)
-            own = feature.seconds if feature.kind == kind else None
+            own = feature.seconds if feature.kind in (kind, "rate") else None
             known[feature.name] = before + (own or 0.0)
     return max(late.values(), default=0.0), max(early.values(), default=0.0)
 
@@ -250,6 +252,11 @@ def _rate(run: Trajectory, feature: Feature) -> Array:
         return _slope(run.time, run[feature.source], step)
     except DfsmError as error:
         raise DfsmError(f"{run.where}: feature '{feature.name}': {error}") from None
+
+
+def _slope_over(run: Trajectory, source: str, seconds: float) -> Array:
+    after, before = (np.interp(run.time + s, run.time, run[source]) for s in (seconds, -seconds))
+    return (after - before) / (2 * seconds)
 
 
 def _slope(time: Array, values: Array, step: float | None) -> Array:

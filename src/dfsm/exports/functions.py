@@ -188,7 +188,10 @@ def computed_inputs(model: DFSM) -> dict[str, str]:
             continue
         source = feature.source
         if feature.kind == "rate":
-            how = f"the time derivative of {source}"
+            over = (
+                "" if feature.seconds is None else f", from {feature.seconds:g} s before to after"
+            )
+            how = f"the time derivative of {source}{over}"
         elif feature.kind == "lag":
             how = f"{source} after a first-order lag of {feature.time_constant:g} s"
         elif feature.kind == "delay":

@@ -218,7 +218,7 @@ def doubts(
 
 def _late(series: Residuals, names: Sequence[str], settings: FitSettings) -> LateInputs | None:
     """Delays that are not there as features yet, to a sample: what these leave is no new delay."""
-    given = [(f.source, f.seconds) for f in settings.features if f.seconds is not None]
+    given = [(f.source, f.seconds) for f in settings.features if f.kind == "delay" and f.seconds]
 
     def there(column: int, seconds: float) -> bool:
         near = max(series.sample, series.step)

@@ -376,7 +376,7 @@ def _between(data: Dataset, settings: FitSettings) -> tuple[Between, ...]:
     A held input that acts late is held: by parts of a sample late, it only looks as if it moved on.
     """
     names = (*settings.controls, *settings.driving)
-    shifted = {f.name: f.source for f in settings.features if f.seconds is not None}
+    shifted = {f.name: f.source for f in settings.features if f.kind in ("delay", "lead")}
     looked = list(dict.fromkeys((*names, *shifted.values())))
     windows = (run.window(settings.start, settings.stop) for run in data)
     found = dict(zip(looked, recognised(windows, looked), strict=True))

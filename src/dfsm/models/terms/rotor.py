@@ -12,7 +12,6 @@ from dfsm.core.host import from_host
 from dfsm.core.settings import require, settings_class
 from dfsm.core.types import Array
 from dfsm.core.units import factor
-from dfsm.data.features import Feature
 from dfsm.data.readers.rotor_table import RotorTable, read_rotor_table
 from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
@@ -49,11 +48,10 @@ class Rotor:
         wind.
     surge_rate
         Channel of the platform's velocity downwind in m/s, which is taken off the wind.
-    overhang, lead
+    overhang, wind_rate
         How far upwind of the tower's place at rest, where `wind` is told, the middle of the blades
-        stands, in m: the rotor meets the wind by so much earlier, see `terms.rotor_place`. Takes
-        the wind in so many seconds, a feature of kind lead, about the time that it needs from the
-        one to the other.
+        stands, in m, and the channel of the wind's rate in m/s² (a feature of kind rate): the rotor
+        meets the wind by so much earlier, see `terms.rotor_place`.
     platform_pitch, surge
         With these, channels of what carries it downwind: the platform's pitch in deg or rad (times
         hub_height), positive downwind, and its surge in m.
@@ -96,7 +94,7 @@ class Rotor:
     pitch_rate: str | None = None
     surge_rate: str | None = None
     overhang: float | None = None
-    lead: float | None = None
+    wind_rate: str | None = None
     platform_pitch: str | None = None
     surge: str | None = None
     gearbox_ratio: float = 1.0
@@ -152,10 +150,8 @@ class Rotor:
         """Where the rotor stands takes a distance and a rate, and says what carries it."""
         finite = self.overhang is None or bool(np.isfinite(self.overhang))
         require(finite, "rotor.overhang", self.overhang, "a number of m, 0 for none")
-        positive = self.lead is None or (bool(np.isfinite(self.lead)) and self.lead > 0)
-        require(positive, "rotor.lead", self.lead, "a positive number of s")
-        if (self.overhang is None) != (self.lead is None):
-            here, lacking = "overhang", "lead"
+        if (self.overhang is None) != (self.wind_rate is None):
+            here, lacking = "overhang", "wind_rate"
             if self.overhang is None:
                 here, lacking = lacking, here
             raise DfsmError(
@@ -166,7 +162,7 @@ class Rotor:
         if carried and self.overhang is None:
             raise DfsmError(
                 f"rotor.{carried[0]} is '{getattr(self, carried[0])}' without rotor.overhang and "
-                "rotor.lead: it moves the place at which the wind is met, set them as well"
+                "rotor.wind_rate: it moves the place at which the wind is met, set them as well"
             )
         if self.platform_pitch is not None and self.hub_height is None:
             raise DfsmError(
@@ -175,16 +171,9 @@ class Rotor:
             )
 
     @property
-    def wind_ahead(self) -> str | None:
-        """Name of the feature that holds the wind in `lead` seconds."""
-        if self.lead is None:
-            return None
-        return Feature(source=self.wind, kind="lead", seconds=self.lead).name
-
-    @property
     def inputs(self) -> tuple[str, ...]:
         """Channels that it takes."""
-        place = (self.wind_ahead, self.platform_pitch, self.surge)
+        place = (self.wind_rate, self.platform_pitch, self.surge)
         motion = (n for n in (self.pitch_rate, self.surge_rate, *place) if n is not None)
         return (self.wind, self.speed, self.pitch, *motion, *self.corrections)
 
@@ -211,15 +200,9 @@ class Rotor:
             read.
         """
         what = f"rotor '{self.name}'"
-        if self.wind_ahead is not None and self.wind_ahead not in channels:
-            raise DfsmError(
-                f"{what}: its lead of {self.lead:g} s takes the wind ahead, '{self.wind_ahead}', "
-                "which is no input of the model: add the feature "
-                f"{{source: {self.wind}, kind: lead, seconds: {self.lead:g}}}"
-            )
         _, at = input_columns(what, self.inputs, channels, columns)
         units = dict.fromkeys(("wind", "surge_rate", "corrections"), "m/s")
-        for key, unit in (units | {"surge": "m"}).items():
+        for key, unit in (units | {"wind_rate": "m/s^2", "surge": "m"}).items():
             named = getattr(self, key)
             for name in named if isinstance(named, tuple) else (named,):
                 if name is not None:
@@ -250,7 +233,6 @@ class Rotor:
             arm=arm,
             surges=self.surge_rate is not None,
             overhang=self.overhang,
-            lead=self.lead,
             lean=lean,
             drifts=self.surge is not None,
             gearbox_ratio=self.gearbox_ratio,

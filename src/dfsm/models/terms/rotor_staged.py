@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dfsm.core.host import from_host
-from dfsm.models.terms.rotor_place import share_ahead
+from dfsm.models.terms.rotor_place import lead_time
 from dfsm.models.terms.rotor_surface import surface_of_rows
 from dfsm.models.terms.rotor_term import RotorTerm
 from dfsm.numerics.hats import hats
@@ -34,13 +34,13 @@ class StagedRotor(RotorTerm):
         moving = about.arm * rest.pop(0) if about.arm is not None else jnp.zeros(())
         if about.surges:
             moving = moving + rest.pop(0)
-        if about.overhang is not None and about.lead is not None:
-            ahead, distance = rest.pop(0), jnp.asarray(about.overhang)
+        if about.overhang is not None:
+            rate, distance = rest.pop(0), jnp.asarray(about.overhang)
             if about.lean is not None:
                 distance = distance - about.lean * rest.pop(0)
             if about.drifts:
                 distance = distance - rest.pop(0)
-            moving = moving - share_ahead(distance, wind, about.lead) * (ahead - wind)
+            moving = moving - lead_time(distance, wind) * rate
         for k in range(self.gains.shape[0]):
             wind = wind + self.gains[k] * rest.pop(0)
         induced = jnp.array([rest.pop(0) for _ in range(about.lags)])

@@ -23,7 +23,7 @@ from dfsm.models.terms.induction import (
     wind_of_inflow,
 )
 from dfsm.models.terms.rotor_check import check_signals
-from dfsm.models.terms.rotor_place import share_ahead
+from dfsm.models.terms.rotor_place import lead_time
 from dfsm.models.terms.rotor_surface import TOLERANCE, Grid, surface_values
 from dfsm.numerics.hats import hats
 
@@ -51,10 +51,12 @@ class RotorConstants:
         What one unit of the pitch rate takes off the wind, in m/s; None without that signal.
     surges
         Whether there is a surge rate.
-    overhang, lead, lean, drifts
+    overhang, lean, drifts
         How far upwind the rotor stands in m, None where it is taken to stand where the wind is
-        told; by how many seconds the wind ahead is; what one unit of platform pitch carries it
-        downwind in m, None without that signal; and whether there is a surge.
+    overhang, lean, drifts
+        How far upwind the rotor stands in m, None where it is taken to stand where the wind is
+        told; what one unit of platform pitch carries it downwind in m, None without that signal;
+        and whether there is a surge.
     ratios, angles
         First and last tip speed ratio and pitch in deg of the table.
     optimum
@@ -88,7 +90,6 @@ class RotorConstants:
     error: float
     lags: int = 0
     overhang: float | None = None
-    lead: float | None = None
     lean: float | None = None
     drifts: bool = False
 
@@ -102,8 +103,8 @@ class RotorConstants:
 class RotorTerm(Term):
     """Thrust in kN and torque in kN m; C² in all signals, and finite everywhere.
 
-    ``v = wind(t + τ) + Σ a_k d_k - hub_height pitch_rate - surge_rate`` is the wind at the rotor,
-    which stands where it meets the wind told for τ later (see `rotor_place`), and
+    ``v = wind + τ wind_rate + Σ a_k d_k - hub_height pitch_rate - surge_rate`` is the wind at the
+    rotor, which stands where it meets the wind told for τ later (see `rotor_place`), and
     ``λ = ω R / v`` its tip speed ratio; thrust is ``½ ρ π R² v² Ct(λ, β)``, torque
     ``½ ρ π R³ v² Cq(λ, β)``. See `rotor_surface` for how the table is continued beyond its ends.
 
@@ -218,8 +219,8 @@ class RotorTerm(Term):
         if about.surges:
             wind = wind - signals[..., at]
             at += 1
-        if about.overhang is not None and about.lead is not None:
-            ahead, distance = signals[..., at], jnp.asarray(about.overhang)
+        if about.overhang is not None:
+            rate, distance = signals[..., at], jnp.asarray(about.overhang)
             at += 1
             if about.lean is not None:
                 distance = distance - about.lean * signals[..., at]
@@ -227,8 +228,7 @@ class RotorTerm(Term):
             if about.drifts:
                 distance = distance - signals[..., at]
                 at += 1
-            told = signals[..., 0]
-            wind = wind + share_ahead(distance, told, about.lead) * (ahead - told)
+            wind = wind + lead_time(distance, signals[..., 0]) * rate
         if corrections := self.gains.shape[0]:
             wind = wind + signals[..., at : at + corrections] @ self.gains
             at += corrections
@@ -408,7 +408,7 @@ class RotorTerm(Term):
     ) -> RotorTerm:
         """The term of which `arrays` and `structure` came."""
         # What models had none of that were made before there was any.
-        place = {"overhang": None, "lead": None, "lean": None, "drifts": False}
+        place = {"overhang": None, "lean": None, "drifts": False}
         told = {"memory": "speed", "uncertainty": 0.0, "lags": 0, **place, **structure["about"]}
         # JSON turns tuples into lists, which are no keys of compiled functions.
         about: dict[str, Any] = {
