@@ -151,7 +151,7 @@ def test_a_delay_needs_its_seconds():
     with pytest.raises(DfsmError, match=r"features\.seconds"):
         Feature(source="u", kind="delay")
     with pytest.raises(DfsmError, match=r"features\.seconds"):
-        Feature(source="u", kind="rate", seconds=1.0)
+        Feature(source="u", kind="lag", time_constant=2.0, seconds=1.0)
 
 
 def test_noise_of_a_sensor_is_told_and_a_white_input_is_not():
