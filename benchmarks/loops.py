@@ -51,7 +51,8 @@ def in_turn(
 
     They are measured by turns, so that a machine that is busy for a while is so for both.
     """
-    one(), other()
+    one()
+    other()
     pairs = []
     for _ in range(repeats):
         begin = time.perf_counter()
