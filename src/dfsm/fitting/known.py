@@ -64,7 +64,7 @@ def known_coefficients(
     mechanics = _mechanics(samples, settings)
     known = {**mechanics, **settings.linear.known}
     fixed, first = dict[tuple[int, int], float](), dict[tuple[int, int], float]()
-    for name in (n for s in settings.terms if isinstance(s, Rotor) for n in s.corrections):
+    for name in (n for s in settings.terms if isinstance(s, Rotor) for n in s.winds):
         fixed.update({(row, names.index(name)): 0.0 for row in rows.values()})
     for state in mechanics:
         # In closed loop torque and blade pitch follow the speed, and least squares on derivatives

@@ -51,7 +51,8 @@ class Rotor:
     overhang, wind_rate
         How far upwind of the tower's place at rest, where `wind` is told, the middle of the blades
         stands, in m, and the channel of the wind's rate in m/s² (a feature of kind rate): the rotor
-        meets the wind by so much earlier, see `terms.rotor_place`.
+        meets the wind by so much earlier, see `terms.rotor_place`. In derivatives that rate acts
+        through the rotor alone.
     platform_pitch, surge
         With these, channels of what carries it downwind: the platform's pitch in deg or rad (times
         hub_height), positive downwind, and its surge in m.
@@ -169,6 +170,11 @@ class Rotor:
                 f"rotor.platform_pitch is '{self.platform_pitch}' without rotor.hub_height: how "
                 "far a platform that leans carries the hub follows from both"
             )
+
+    @property
+    def winds(self) -> tuple[str, ...]:
+        """Channels of wind that act on derivatives through the rotor alone."""
+        return (*self.corrections, *(() if self.wind_rate is None else (self.wind_rate,)))
 
     @property
     def inputs(self) -> tuple[str, ...]:
