@@ -197,11 +197,16 @@ SPINNING = dfsm.FitSettings(
 RING = 0.4
 
 
-def spinning(seed: int, mean: float) -> Trajectory:
-    """A rotor in closed loop in wind of which a share of the ring's is no part of `Wind`."""
+def spinning(seed: int, mean: float, overhang: float | None = None) -> Trajectory:
+    """A rotor in closed loop in wind of which a share of the ring's is no part of `Wind`.
+
+    One with an overhang in m stands so far upwind of where the wind is told, less what it leans,
+    and the ring tells it nothing.
+    """
+    share, pace = (RING, 0.3) if overhang is None else (0.0, 0.15)
     rng = np.random.default_rng(seed)
     time = np.arange(0, 300.01, 0.25)
-    wind, ring = wander(rng, mean, 1.5, 0.3), wander(rng, 0.0, 0.8, 0.3)
+    wind, ring = wander(rng, mean, 1.5, pace), wander(rng, 0.0, 0.8, pace)
     table = dfsm.read_rotor_table(TABLE)
     channels = {c: Channel(c, u) for c, u in (("Wind", "m/s"), ("Speed", "rpm"), ("Pitch", "deg"))}
     columns = {name: k for k, name in enumerate(channels)}
@@ -213,8 +218,9 @@ def spinning(seed: int, mean: float) -> Trajectory:
         return 1.5e3 * speed, max(0.0, 4.0 * (speed - 6.5))
 
     def f(t: float, x: Array) -> list[float]:
-        at = np.array([t])
-        flow = float(wind(at)[0] + RING * ring(at)[0]) - HUB * np.deg2rad(x[1])
+        ahead = 0.0 if overhang is None else (overhang - HUB * np.deg2rad(x[0])) / mean
+        at = np.array([t + ahead])
+        flow = float(wind(at)[0] + share * ring(at)[0]) - HUB * np.deg2rad(x[1])
         torque, pitch = controls(x[2])
         thrust, driving = np.asarray(forces(jnp.array([flow, x[2], pitch])))
         lean = -0.06 * x[0] - 0.05 * x[1] + 2e-4 * thrust
@@ -265,6 +271,24 @@ def test_what_reaches_the_rotor_is_learnt_from_rollouts(started, turbines):
     ]
     assert errors[1] < 0.05
     assert errors[0] > 3 * errors[1]
+
+
+def test_the_wind_is_met_where_a_rotor_stands():
+    runs = [spinning(seed, mean, 24.0) for seed, mean in enumerate((8.0, 13.0, 10.0))]
+    gusts = dfsm.Feature(source="Wind", kind="rate", seconds=0.5)
+    place = {"overhang": 24.0, "wind_rate": gusts.name, "platform_pitch": "Lean"}
+    there = replace(SPINNING, features=(gusts,), terms=(replace(ROTOR, **place),))
+    errors = []
+    for settings in (SPINNING, there):
+        with hushed():
+            model = dfsm.fit(runs[:2], settings).model
+            found = dfsm.simulate(model, runs[2], stop=299).trajectory
+        seen = runs[2].window(None, 299)
+        errors.append(np.sqrt(np.mean((found["Speed"] - seen["Speed"]) ** 2)))
+    # The wind's rate has no other way to act.
+    names = [c.name for c in (*model.signals.inputs, *model.terms.channels)]
+    assert not np.asarray(model.f.coefficients)[..., names.index(gusts.name)].any()
+    assert errors[1] < 0.4 * errors[0]
 
 
 @pytest.fixture(scope="module")
