@@ -97,7 +97,7 @@ def _constant(grid: np.ndarray, parts: Sequence[RolloutErrors]) -> np.ndarray:
 def _turbine() -> Case:
     turbine, rotor = bundled(), neighbour("rotor_model")
     training = [*turbine.runs(turbine.ALL_WINDS, range(1, 3)), *turbine.perturbed(testing=False)]
-    base = rotor.settings(())
+    base = rotor.settings((), drag=False)
     table = replace(base.terms[0], memory="speed", induction="steady", uncertainty=0.0)
     kept = {"corrected": None, "azimuth": None, "outputs": ("TwrBsMyt",)}
     bare = {"corrective": dfsm.NoCorrection(), **kept}

@@ -43,13 +43,14 @@ def run() -> dict[str, Any]:
     nowhere = {"overhang": None, "wind_rate": None, "platform_pitch": None}
 
     def with_rotor(settings: dfsm.FitSettings, **changes: Any) -> dfsm.FitSettings:
-        terms = (replace(term, **changes) for term in settings.terms)
-        return replace(settings, **bare, terms=tuple(terms))
+        of_rotor, *drag = settings.terms
+        return replace(settings, **bare, terms=(replace(of_rotor, **changes), *drag))
 
-    still = with_rotor(rotor.settings(ahead=()), **nowhere)
-    ahead = with_rotor(rotor.settings(), **nowhere)
+    still = with_rotor(rotor.settings(ahead=(), drag=False), **nowhere)
+    ahead = with_rotor(rotor.settings(drag=False), **nowhere)
+    there = with_rotor(rotor.settings(drag=False))
     steady = {**nowhere, "induction": "steady", "uncertainty": 0.0}
-    table = with_rotor(rotor.settings((), ()), memory="speed", **steady)
+    table = with_rotor(rotor.settings((), (), drag=False), memory="speed", **steady)
     rings = with_rotor(still, memory="speed", **steady)
     through_wind = with_rotor(still, **steady)
     factors = with_rotor(still, induction="steady")
@@ -67,7 +68,8 @@ def run() -> dict[str, Any]:
         ("and latent states of wind and waves alone", factors, by_wind),
         ("and induced velocities that lag", still, by_wind),
         ("and the waves some seconds ahead", ahead, rotor.REFINEMENT),
-        ("and the wind where the rotor stands", with_rotor(rotor.settings()), rotor.REFINEMENT),
+        ("and the wind where the rotor stands", there, rotor.REFINEMENT),
+        ("and quadratic drag of the hull", with_rotor(rotor.settings()), rotor.REFINEMENT),
     ):
         begin = time.perf_counter()
         with warnings.catch_warnings():

@@ -4,7 +4,8 @@ The table of the rotor's thrust and torque is part of the linear fit; wind and b
 relative to the moving hub, the wind when it is where the rotor stands, and the induced velocity
 lags behind. What runs add is small and the same at all winds. From the wind field come averages
 over rings of the rotor, of which refinement learns how much each counts. Waves act on the hull
-before they arrive where their elevation is told. Trained at 6, 12 and 18 m/s, tested at 8, 10, 14
+before they arrive where their elevation is told, and the water slows large swings down more than
+small ones. Trained at 6, 12 and 18 m/s, tested at 8, 10, 14
 and 16 m/s, too.
 
     python examples/iea15/rotor_model.py [--output out/]
@@ -44,7 +45,9 @@ AHEAD = tuple(dfsm.Feature(source="Wave1Elev", kind="lead", seconds=s) for s in 
 OVERHANG = 12.03 + 0.75 * 120.97 * math.sin(math.radians(4))
 # The wind's rate, by which it meets the wind earlier; over two seconds, for nothing faster counts.
 GUSTS = dfsm.Feature(source="RotWind", kind="rate", seconds=1.0)
-# What moves the platform besides the rotor, by the equation of motion in pitch.
+# Of the hull and its plates in the water, with the square of the pitch rate.
+DRAG = dfsm.QuadraticDrag(velocity="PtfmPitch_dot", name="drag")
+# What moves the platform besides the rotor and drag, by the equation of motion in pitch.
 HYDRODYNAMICS = (
     *("PtfmPitch", "PtfmPitch_dot", "Wave1Elev", "Wave1Elev_dot"),
     *("RotShearV", "RotShearH"),
@@ -74,13 +77,16 @@ def rotor(rings: Sequence[str] = RINGS) -> dfsm.Rotor:
 
 
 def settings(
-    rings: Sequence[str] = RINGS, ahead: Sequence[dfsm.Feature] = AHEAD
+    rings: Sequence[str] = RINGS,
+    ahead: Sequence[dfsm.Feature] = AHEAD,
+    drag: bool = True,
 ) -> dfsm.FitSettings:
     """Signals and structure. Wave forces need the elevation's rate, and what it will be.
 
     Only outputs are corrected: what controllers and optimizers do with a model, no run did.
     """
-    hydrodynamics = (*HYDRODYNAMICS, *(feature.name for feature in ahead))
+    dragging = (DRAG,) if drag else ()
+    moving = (*HYDRODYNAMICS, *("drag" for _ in dragging), *(feature.name for feature in ahead))
     excess = (dfsm.Feature(source=r, kind="difference", less="RotWind") for r in rings)
     return dfsm.FitSettings(
         states=(
@@ -96,12 +102,12 @@ def settings(
             *excess,
         ),
         outputs=OUTPUTS,
-        terms=(rotor(rings),),
+        terms=(rotor(rings), *dragging),
         linear=dfsm.LPV(
             schedule="RotWind",
             points=9,
             margin=0.01,
-            only={"PtfmPitch": ("rotor.thrust", "rotor.torque", *hydrodynamics)},
+            only={"PtfmPitch": ("rotor.thrust", "rotor.torque", *moving)},
         ),
         corrective=dfsm.RBF(),
         corrected=OUTPUTS,
