@@ -270,13 +270,8 @@ def _lagged(values: Array, lag: float) -> Array:
 
 def late_note(row: str, names: Sequence[str], late: LateInputs, unexplained: float) -> str:
     """Which inputs act late, by how much, and what to set."""
-    told = [(names[c], f"{s:.3g}") for c, s in late.seconds.items()]
-    one = len(told) == 1
-    acting = " and ".join(
-        f"'{name}' acts about {s} s late" if k == 0 else f"'{name}' about {s} s"
-        for k, (name, s) in enumerate(told)
-    )
-    features = ", ".join(f"{{source: {name}, kind: delay, seconds: {s}}}" for name, s in told)
+    acting, features = _acting(names, late, "late", "delay")
+    one = len(late.seconds) == 1
     return (
         f"{row}: {acting}: so delayed {'it leaves' if one else 'they leave'} "
         f"{late.unexplained:.1%} of the row unexplained instead of {unexplained:.1%}, and without "
@@ -287,18 +282,23 @@ def late_note(row: str, names: Sequence[str], late: LateInputs, unexplained: flo
 
 def early_note(row: str, names: Sequence[str], early: LateInputs, unexplained: float) -> str:
     """Which disturbances act before they are recorded, by how much, and what to set."""
-    told = [(names[c], f"{-s:.3g}") for c, s in early.seconds.items()]
-    acting = " and ".join(
-        f"'{name}' acts about {s} s before it is recorded" if k == 0 else f"'{name}' about {s} s"
-        for k, (name, s) in enumerate(told)
-    )
-    features = ", ".join(f"{{source: {name}, kind: lead, seconds: {s}}}" for name, s in told)
+    acting, features = _acting(names, early, "before it is recorded", "lead")
     return (
         f"{row}: {acting}: so advanced {early.unexplained:.1%} of the row is left unexplained "
         f"instead of {unexplained:.1%}; measured behind the plant, or by a late clock, it wants "
-        f"the feature{'s' * (len(told) > 1)} {features}; where its rate acts, one of kind rate; "
-        "where it follows from the states it is an output"
+        f"the feature{'s' * (len(early.seconds) > 1)} {features}; where its rate acts, one of kind "
+        "rate; where it follows from the states it is an output"
     )
+
+
+def _acting(names: Sequence[str], late: LateInputs, how: str, kind: str) -> tuple[str, str]:
+    """Inputs with the seconds by which they act otherwise, and the features that say so."""
+    told = [(names[c], f"{abs(s):.3g}") for c, s in late.seconds.items()]
+    acting = " and ".join(
+        f"'{name}' acts about {s} s {how}" if k == 0 else f"'{name}' about {s} s"
+        for k, (name, s) in enumerate(told)
+    )
+    return acting, ", ".join(f"{{source: {n}, kind: {kind}, seconds: {s}}}" for n, s in told)
 
 
 def lag_note(row: str, state: str, order: int, lag: Lag, unexplained: float) -> str:

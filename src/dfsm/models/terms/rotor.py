@@ -126,39 +126,35 @@ class Rotor:
         known = bool(np.isfinite(self.uncertainty)) and 0 <= self.uncertainty <= 1
         require(known, "rotor.uncertainty", self.uncertainty, "a share from 0 to 1")
         require(bool(self.name), "rotor.name", "empty", "a name for its values")
-        if (self.hub_height is None) != (self.pitch_rate is None):
-            here, lacking = ("hub_height", "pitch_rate")
-            if self.hub_height is None:
-                here, lacking = lacking, here
-            raise DfsmError(
-                f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: the platform's "
-                "motion at the hub is their product, set both or neither"
-            )
+        self._require_both(
+            "hub_height", "pitch_rate", "the platform's motion at the hub is their product"
+        )
         self._check_place()
-        if (self.inertia is None) != (self.generator_torque is None):
-            here, lacking = "inertia", "generator_torque"
-            if self.inertia is None:
-                here, lacking = lacking, here
-            raise DfsmError(
-                f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: what a torque "
-                "does to the speed takes both, set both or neither"
-            )
+        self._require_both(
+            "inertia", "generator_torque", "what a torque does to the speed takes both"
+        )
         twice = [n for n in self.inputs if self.inputs.count(n) > 1]
         if twice:
             raise DfsmError(f"rotor: channel '{twice[0]}' is named twice: name it once")
+
+    def _require_both(self, first: str, second: str, why: str) -> None:
+        """Of two settings that need each other none may stand alone."""
+        if (getattr(self, first) is None) != (getattr(self, second) is None):
+            here, lacking = (first, second) if getattr(self, second) is None else (second, first)
+            raise DfsmError(
+                f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: {why}, set both "
+                "or neither"
+            )
 
     def _check_place(self) -> None:
         """Where the rotor stands takes a distance and a rate, and says what carries it."""
         finite = self.overhang is None or bool(np.isfinite(self.overhang))
         require(finite, "rotor.overhang", self.overhang, "a number of m, 0 for none")
-        if (self.overhang is None) != (self.wind_rate is None):
-            here, lacking = "overhang", "wind_rate"
-            if self.overhang is None:
-                here, lacking = lacking, here
-            raise DfsmError(
-                f"rotor.{here} is {getattr(self, here)} without rotor.{lacking}: what a rotor "
-                "meets that stands elsewhere follows from both, set both or neither"
-            )
+        self._require_both(
+            "overhang",
+            "wind_rate",
+            "what a rotor meets that stands elsewhere follows from both",
+        )
         carried = [key for key in ("platform_pitch", "surge") if getattr(self, key) is not None]
         if carried and self.overhang is None:
             raise DfsmError(
