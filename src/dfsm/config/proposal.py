@@ -38,6 +38,8 @@ _TURBINE = {*_SECOND_ORDER, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
 # RMS that is left of the rate of a state, and of a second derivative that nobody recorded, above
 # which a state is not to be told by derivatives alone: the latter are less sure on coarse samples.
 _CLEAR, _CLEAR_TWICE = 0.22, 0.1
+# States of order 2 with unmeasured rates up to which rates are told as hidden states.
+_MOST_RATES = 3
 _MOST_CHANNELS = 60
 
 
@@ -66,6 +68,9 @@ class Proposal:
     unexplained
         Then, of the derivatives of the states, what recorded channels leave: RMS over the standard
         deviation, by state.
+    coarse
+        Then, states whose second derivative is not to be had, with their samples per swing once
+        noise is averaged out.
     """
 
     states: list[dict[str, Any]]
@@ -80,6 +85,7 @@ class Proposal:
     held: tuple[str, ...] = ()
     hidden: bool = False
     unexplained: dict[str, float] = field(default_factory=dict)
+    coarse: dict[str, float] = field(default_factory=dict)
 
 
 @threadpool_limits.wrap(limits=1)
@@ -162,16 +168,19 @@ def _of_anything(
     found = Judge(runs, names, rates, held).roles()
     clear = bool(found.orders) and all(found.left[n] <= _CLEAR for n in found.orders)
     clear &= all(found.left[n] <= _CLEAR_TWICE for n, order in found.orders.items() if order == 2)
-    if not rates and not (clear and found.inputs):
+    even = uneven([r.time for r in runs])[1] is None
+    coarse = found.coarse if even and len(found.orders) <= _MOST_RATES else {}
+    if not rates and not (clear and found.inputs and not coarse):
         run, measured = max(runs, key=len), [n for n in names if n not in found.outputs]
         driven = driven_by_past(run, measured)
         # Where both ways tell a state, they must tell the same one.
         if driven and {*found.orders} <= {*driven}:
-            even = uneven([r.time for r in runs])[1] is None
             hidden = _with_hidden(run, measured, driven, parameters, reasons, hidden=even)
             reasons |= {n: found.reasons[n] for n in found.outputs}
-            left = {n: found.left[n] for n in driven if n in found.left} if even else {}
-            return replace(hidden, unexplained=left, outputs=found.outputs)
+            if not even:
+                return replace(hidden, outputs=found.outputs)
+            left = {n: found.left[n] for n in driven if n in found.left and n not in coarse}
+            return replace(hidden, unexplained=left, coarse=coarse, outputs=found.outputs)
     reasons |= {n: text for n, text in found.reasons.items() if n not in held or "set-p" in text}
     states = [
         _second_order(n, rates) | {"order": order} if order == 1 else _second_order(n, rates)

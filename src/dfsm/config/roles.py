@@ -42,6 +42,9 @@ _CLEARLY = 4.0
 _BENT, _DEGREE, _SAMPLES, _BLOCKS = 7, 3, 20, 40
 # Highest power of one channel alone.
 _HIGHEST = 5
+# Samples per swing, or windows where noise has to be averaged out, below which a second derivative
+# is not to be had: its error goes with their square and, in rollouts, with how little is damped.
+_PER_SWING = 40.0
 # Without what drives it, a system leaves more than so many times as much.
 _NO_MORE = 1.1
 
@@ -66,6 +69,9 @@ class Roles:
     left
         RMS that is left of the rate of each channel, relative to its standard deviation, without
         the share of noise.
+    coarse
+        States of order 2 whose second derivative is not to be had, with their samples per swing
+        once noise is averaged out.
     set_points
         Channels that act through another only, with that one.
     reasons
@@ -76,6 +82,7 @@ class Roles:
     outputs: list[str] = field(default_factory=list)
     inputs: list[str] = field(default_factory=list)
     left: dict[str, float] = field(default_factory=dict)
+    coarse: dict[str, float] = field(default_factory=dict)
     set_points: dict[str, str] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
 
@@ -255,6 +262,8 @@ class Judge:
             return 0
         if order == 2:
             found.left[name] = second**0.5
+            if (per_swing := self.windows.per_swing(name)) < _PER_SWING:
+                found.coarse[name] = per_swing
         found.reasons[name] = (
             "state of order 2: its second derivative follows from it and the others"
             if order == 2

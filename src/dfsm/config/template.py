@@ -181,7 +181,13 @@ def _hidden_told(proposed: Proposal) -> str:
     if not proposed.hidden:
         return ""
     left = ", ".join(f"{share:.0%} of that of {n}" for n, share in proposed.unexplained.items())
-    why = f" (what is recorded leaves {left})" if left else ""
+    told = [f"what is recorded leaves {left}"] if left else []
+    told += [
+        f"{n} has too few samples per swing for a second derivative, about {per_swing:.0f} once "
+        "noise is averaged out"
+        for n, per_swing in proposed.coarse.items()
+    ]
+    why = f" ({'; '.join(told)})" if told else ""
     return (
         f"Derivatives are not to be fitted here{why}: hidden fits rollouts instead, with states "
         "that nobody measures"

@@ -119,6 +119,17 @@ class Windows:
                 return span, share
             span *= 2
 
+    def per_swing(self, name: str) -> float:
+        """Windows per swing of a channel, of the length at which noise is next to nothing.
+
+        The swing is that of the mean square of the second derivative over that of the first.
+        """
+        column = self.names.index(name)
+        span, _ = self.span(column, 2)
+        first, second = (np.var(self.rows(o, span).change[:, column]) for o in (1, 2))
+        rate = np.sqrt(second / max(first, np.finfo(float).tiny))
+        return float(2 * np.pi / max(rate * span * self.usual, np.finfo(float).tiny))
+
     def _own_noise(self, column: int, order: int, span: int) -> float:
         """Share of the change of a channel that its noise is."""
         variance = np.var(self.rows(order, span).change[:, column])
