@@ -37,6 +37,9 @@ _DOES_WITHOUT, _COSTS, _ROUNDS = 2.0, 0.02, 6
 # A lag has the word before delays that leave so many times as much; it, or an early input, is the
 # whole story only where no more than this is unexplained with it: beyond, several are missing.
 _CLEARER, _WHOLE = 2.0, 0.25
+# Columns that follow from others to so much, and the share of a variance that rounding leaves of
+# everything.
+_RANK, _ROUNDING = 1e-12, 1e-12
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,9 @@ def _in_turn(
     lags = dict(start)
 
     def best(column: int, tried: Array) -> tuple[float, float]:
-        return min((rows.left({**lags, column: float(lag)}), float(lag)) for lag in tried)
+        left = rows.left_of_each(lags, column, tried)
+        k = int(np.argmin(left))
+        return float(left[k]), float(tried[k])
 
     for _ in range(_ROUNDS):
         before = dict(lags)
@@ -212,19 +217,63 @@ class _Rows:
         X, y = stacked(residuals.inputs), stacked(residuals.targets)
         X, y = X - X.mean(axis=0), y - y.mean()
         self.table = np.column_stack([X, y])
-        self.gram = self.table.T @ self.table
-        self.shifted: dict[tuple[int, float], tuple[Array, Array]] = {}
+        self._shifted: dict[tuple[int, tuple[float, ...]], Array] = {}
+        # Products of a column at many lags with all columns, and the lags that these had.
+        self._products: dict[tuple[int, tuple[float, ...]], tuple[Array, Array]] = {}
+        self._known = b"", np.zeros((0, 0))
 
     def left(self, lags: Mapping[int, float]) -> float:
         """Variance left, the inputs in some columns being so many intervals late."""
-        late = {c: self._late(c, lag) for c, lag in lags.items() if lag}
-        gram = self.gram.copy()
-        for column, (_, products) in late.items():
-            gram[column], gram[:, column] = products, products
-        for column, (values, _) in late.items():
-            for other, (others, _) in late.items():
-                gram[column, other] = values @ others
-        return self._rest(gram)
+        return self._rest(self._gram(self._lags(lags)))
+
+    def left_of_each(self, lags: Mapping[int, float], column: int, tried: Array) -> Array:
+        """Variance left with each of some lags of one column, the others as in `lags`.
+
+        What one column more explains follows from its products with the others and the target
+        (Frisch & Waugh 1933).
+        """
+        now = self._lags(lags)
+        products = self._against(column, tried, now)
+        others = np.delete(np.arange(self.table.shape[1] - 1), column)
+        gram = self._gram(now)
+        gram, right, whole = gram[np.ix_(others, others)], gram[others, -1], gram[-1, -1]
+        scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+        inverse = np.linalg.pinv(gram / np.outer(scale, scale), _RANK, hermitian=True)
+        own = products[:, others] / scale
+        by_others = inverse @ (right / scale)
+        size = np.sum(self._late(column, tried) ** 2, axis=1)
+        rest = size - np.einsum("li,ij,lj->l", own, inverse, own)
+        more = products[:, -1] - own @ by_others
+        gain = np.where(rest > _RANK * size, more**2, 0.0) / np.where(rest > _RANK * size, rest, 1)
+        share = (whole - (right / scale) @ by_others - gain) / whole
+        return np.maximum(share, _ROUNDING) * whole / len(self.table)
+
+    def _lags(self, lags: Mapping[int, float]) -> Array:
+        """Of all columns, that of the target included."""
+        now = np.zeros(self.table.shape[1])
+        now[list(lags)] = list(lags.values())
+        return now
+
+    def _against(self, column: int, tried: Array, now: Array) -> Array:
+        """Products of a column at some lags with all columns as late as they are."""
+        key = column, tuple(tried.tolist())
+        late = self._late(column, tried)
+        if key not in self._products:
+            self._products[key] = late @ self.table, np.zeros(len(now))
+        products, before = self._products[key]
+        for other in np.flatnonzero(now != before):
+            products[:, other] = late @ self._late(other, now[other : other + 1])[0]
+        before[:] = now
+        return products
+
+    def _gram(self, now: Array) -> Array:
+        """Products of all columns with each other, as late as they are."""
+        if self._known[0] != now.tobytes():
+            table = self.table.copy()
+            for column in np.flatnonzero(now).tolist():
+                table[:, column] = self._late(column, now[column : column + 1])[0]
+            self._known = now.tobytes(), table.T @ table
+        return self._known[1]
 
     def behind(self, columns: Sequence[int], lag: float) -> float:
         """Variance left, all of some columns being behind a first-order lag."""
@@ -234,21 +283,21 @@ class _Rows:
         table[:, some] = lagged - lagged.mean(axis=0)
         return self._rest(table.T @ table)
 
-    def _late(self, column: int, lag: float) -> tuple[Array, Array]:
-        """An input so late, and its products with the table."""
-        if (column, lag) not in self.shifted:
-            late = stacked([_shifted(run[:, column], lag) for run in self.runs])
-            late = late - late.mean()
-            self.shifted[column, lag] = late, self.table.T @ late
-        return self.shifted[column, lag]
+    def _late(self, column: int, lags: Array) -> Array:
+        """An input as late as each of some lags says, ``(lag, sample)``."""
+        key = column, tuple(lags.tolist())
+        if key not in self._shifted:
+            late = [stacked([_shifted(r[:, column], lag) for r in self.runs]) for lag in lags]
+            late = np.stack(late)
+            self._shifted[key] = late - late.mean(axis=1, keepdims=True)
+        return self._shifted[key]
 
     def _rest(self, gram: Array) -> float:
         scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         gram = gram / np.outer(scale, scale)
         inner, right = gram[:-1, :-1], gram[:-1, -1]
-        share = 1 - right @ np.linalg.lstsq(inner, right, rcond=1e-12)[0]
-        # Rounding leaves something of everything.
-        share = max(float(share), 1e-12)
+        share = 1 - right @ np.linalg.lstsq(inner, right, rcond=_RANK)[0]
+        share = max(float(share), _ROUNDING)
         return share * float(scale[-1]) ** 2 / len(self.table)
 
 
