@@ -119,16 +119,21 @@ class Windows:
                 return span, share
             span *= 2
 
-    def per_swing(self, name: str) -> float:
-        """Windows per swing of a channel, of the length at which noise is next to nothing.
+    def swing(self, name: str) -> float:
+        """Time in s that a channel takes for a swing, by its second derivative over its first.
 
-        The swing is that of the mean square of the second derivative over that of the first.
+        Over windows of the length at which noise is next to nothing.
         """
         column = self.names.index(name)
         span, _ = self.span(column, 2)
         first, second = (np.var(self.rows(o, span).change[:, column]) for o in (1, 2))
-        rate = np.sqrt(second / max(first, np.finfo(float).tiny))
-        return float(2 * np.pi / max(rate * span * self.usual, np.finfo(float).tiny))
+        tiny = np.finfo(float).tiny
+        return float(2 * np.pi * np.sqrt(first / max(second, tiny)))
+
+    def per_swing(self, name: str) -> float:
+        """Such windows per swing."""
+        span, _ = self.span(self.names.index(name), 2)
+        return self.swing(name) / (span * self.usual)
 
     def _own_noise(self, column: int, order: int, span: int) -> float:
         """Share of the change of a channel that its noise is."""

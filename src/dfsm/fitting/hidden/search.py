@@ -14,13 +14,14 @@ from typing import get_args
 
 import numpy as np
 
-from dfsm.core.types import Array
 from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
+from dfsm.data.windows import Windows as Motion
 from dfsm.fitting.hidden.error import HiddenError
 from dfsm.fitting.hidden.form import Form, polynomial
-from dfsm.fitting.hidden.sensors import Sensed, as_recorded, behind, sensed
+from dfsm.fitting.hidden.sensors import Sensed, as_recorded, sensed
 from dfsm.fitting.hidden.settings import HiddenSettings
+from dfsm.fitting.hidden.short_windows import from_short_windows, starts_of
 from dfsm.fitting.hidden.starts import (
     Candidate,
     behind_sensors,
@@ -41,7 +42,12 @@ _WORTH_A_STATE, _WORTH_A_KIND, _STEP_ERROR = 0.7, 0.95, 0.01
 _WORTH_A_SENSOR = 0.7
 # Linear systems whose squared error is no more than so many times the least may be enough.
 _NEARLY = 2.0
-_MOST_STEPS = 8
+# A start that leaves more than this share of the linear system's squared error leads nowhere. One
+# that leaves less and runs away is right about the record and wrong beyond: nothing mends that.
+# What leaves so little is left as it is.
+_LEADS, _ENOUGH = 0.5, 0.05
+# Most steps per sample, and radians of a swing up to which one is enough to begin with.
+_MOST_STEPS, _PER_STEP = 8, 1.0
 # The polynomial and some draws of tanh units go first.
 _SCOUTS = 4
 _MOST_MONOMIALS = 60
@@ -50,8 +56,6 @@ _BEYOND = 1.5
 # Steps to follow a change of the integration, and to learn from all data at last: the fewest, and
 # all there are where data are many.
 _FOLLOW, _LAST = 8, 5
-# Samples that tell the state at the start of a window.
-_HEAD = 100
 
 
 @dataclass(frozen=True)
@@ -114,25 +118,26 @@ def search(
         Of the draws.
     """
     standard, kinds = standard_of(records, outputs), tuple(kinds)
-    windows = windows_of(records, standard, kinds, 1, settings.samples)
-    linear = _behind(records, standard, (kinds, windows), settings)
+    asked = _Asked(records, standard, open_kinds, settings, _first_steps(records, outputs))
+    windows = asked.windows(kinds)
+    linear = _behind(asked, kinds, windows)
     gains = {c: candidate.error for c, candidate in linear.items()}
     if settings.count is not None:
         linear = {settings.count: linear[settings.count]}
     counts = _promising(linear, windows, settings)
     linear = {c: linear[c] for c in counts}
-    kinds, kinds_tried = _interpolation(
-        records, standard, linear[counts[0]], (kinds, open_kinds), settings
-    )
-    windows = windows_of(records, standard, kinds, 1, settings.samples)
+    kinds, kinds_tried = _interpolation(asked, linear[counts[0]], kinds)
+    windows = asked.windows(kinds)
     best, tried = _ascended(linear, windows, settings, seed)
+    best, kinds = _interpolated(asked, best, kinds)
     further = last_steps(best, settings.iterations)
-    best, steps = _steps(records, standard, best, kinds, settings)
+    best, steps = _steps(asked, best, kinds)
     everything = windows_of(records, standard, kinds, steps).with_all()
     error = best.error
-    weights = _restarted(
-        best, windows_of(records, standard, kinds, steps, settings.samples), everything
-    )
+    weights = best.weights
+    if len(windows.y) < len(everything.y):
+        starts = starts_of(best.form, best.parameters, everything)
+        weights = np.concatenate([best.parameters, starts.ravel()])
     few = everything.used.sum() <= settings.samples
     last = further if few else _LAST
     final = improved(best.form, everything, weights, settings.decay, last)
@@ -140,14 +145,46 @@ def search(
     return Found(final, standard, kinds, steps, everything, gains, tried, kinds_tried)
 
 
-def _behind(
-    records: Sequence[Trajectory],
-    standard: Standard,
-    drive: tuple[tuple[Between, ...], Windows],
-    settings: HiddenSettings,
-) -> dict[int, Candidate]:
+@dataclass(frozen=True)
+class _Asked:
+    """Records and what is asked of them, see `search`; `steps` are those per sample at first."""
+
+    records: Sequence[Trajectory]
+    standard: Standard
+    open_kinds: Sequence[bool]
+    settings: HiddenSettings
+    steps: int
+
+    def windows(self, kinds: Sequence[Between], steps: int | None = None) -> Windows:
+        """As much of the records as the search looks at."""
+        most = self.settings.samples
+        return windows_of(self.records, self.standard, kinds, steps or self.steps, most)
+
+    def others(self, kinds: tuple[Between, ...]) -> dict[Between, tuple[Between, ...]]:
+        """By what inputs that nobody named may do instead, what all inputs do then."""
+        if not any(self.open_kinds):
+            return {}
+        each = {
+            kind: tuple(kind if free else k for k, free in zip(kinds, self.open_kinds, strict=True))
+            for kind in get_args(Between)
+        }
+        return {kind: all_kinds for kind, all_kinds in each.items() if all_kinds != kinds}
+
+
+def _first_steps(records: Sequence[Trajectory], outputs: int) -> int:
+    """Steps per sample that the swings of what is measured ask of Runge and Kutta."""
+    names = records[0].names[:outputs]
+    windows = Motion(records, names)
+    fastest = min(windows.swing(name) for name in names)
+    steps = 1
+    while steps < _MOST_STEPS and 2 * np.pi * windows.usual / (steps * fastest) > _PER_STEP:
+        steps *= 2
+    return steps
+
+
+def _behind(asked: _Asked, kinds: Sequence[Between], windows: Windows) -> dict[int, Candidate]:
     """Linear systems by the number of hidden states, behind the instruments that records tell."""
-    kinds, windows = drive
+    records, standard, settings = asked.records, asked.standard, asked.settings
     told = sensed(records, standard, settings.output)
     if told is None or settings.output is None:
         plain = _linear(as_recorded(records), standard, (windows, windows), settings)
@@ -155,7 +192,7 @@ def _behind(
             return plain
     else:
         plain = {}
-    unfolded = windows_of(told.records, standard, kinds, 1, settings.samples)
+    unfolded = replace(asked, records=told.records).windows(kinds)
     behind = _linear(told, standard, (unfolded, windows), settings)
     least = min((c.error for c in plain.values()), default=np.inf)
     return behind if min(c.error for c in behind.values()) < _WORTH_A_SENSOR * least else plain
@@ -210,6 +247,19 @@ def _simplest(linear: Candidate, windows: Windows, settings: HiddenSettings) -> 
     return improved(form, windows, start, settings.decay, settings.iterations).error
 
 
+def _from(
+    linear: Candidate, form: Form, draw: int, windows: Windows, settings: HiddenSettings
+) -> Candidate:
+    """Where a nonlinear start leads; by way of short windows where it leads nowhere at once."""
+    weights = nonlinear_start(linear, form, draw)
+    found = improved(form, windows, weights, settings.decay, settings.iterations)
+    if found.error <= max(_LEADS * linear.error, _ENOUGH):
+        return found
+    weights = from_short_windows(form, weights, windows, settings.decay)
+    again = improved(form, windows, weights, settings.decay, settings.iterations)
+    return min(found, again, key=_error)
+
+
 def _ascended(
     linear: dict[int, Candidate], windows: Windows, settings: HiddenSettings, seed: int
 ) -> tuple[Candidate, list[tuple[str, int, float]]]:
@@ -251,8 +301,7 @@ def _nonlinear(
 
     def one(task: tuple[Form, int]) -> Candidate:
         form, draw = task
-        weights = nonlinear_start(linear, form, draw)
-        found = improved(form, windows, weights, settings.decay, settings.iterations)
+        found = _from(linear, form, draw, windows, settings)
         return replace(found, error=np.inf) if runs_away(found, windows) else found
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -278,51 +327,50 @@ def _forms(
 
 
 def _interpolation(
-    records: Sequence[Trajectory],
-    standard: Standard,
-    linear: Candidate,
-    kinds: tuple[tuple[Between, ...], Sequence[bool]],
-    settings: HiddenSettings,
+    asked: _Asked, linear: Candidate, kinds: tuple[Between, ...]
 ) -> tuple[tuple[Between, ...], dict[str, float]]:
     """What inputs that nobody named do between samples, by what explains the data.
 
     A nonlinear start tells, the simplest there is: beside what a linear system leaves over, what
     inputs do between samples may be little.
     """
-    now, open_kinds = kinds
-    if not any(open_kinds):
-        return now, {}
-    tried: dict[str, tuple[Between, ...]] = {}
-    errors: dict[str, float] = {}
-    for kind in get_args(Between):
-        pairs = zip(now, open_kinds, strict=True)
-        tried[kind] = tuple(kind if free else k for k, free in pairs)
-        windows = windows_of(records, standard, tried[kind], 1, settings.samples)
-        errors[kind] = _simplest(linear, windows, settings)
-    current = next(k for k, free in zip(now, open_kinds, strict=True) if free)
-    least = min(errors, key=errors.__getitem__)
-    return tried[least if errors[least] < _WORTH_A_KIND * errors[current] else current], errors
+    others = asked.others(kinds)
+    if not others:
+        return kinds, {}
+    now = next(k for k, free in zip(kinds, asked.open_kinds, strict=True) if free)
+    tried = {kind: others.get(kind, kinds) for kind in get_args(Between)}
+    errors: dict[str, float] = {
+        kind: _simplest(linear, asked.windows(each), asked.settings) for kind, each in tried.items()
+    }
+    least = min(tried, key=lambda kind: errors[kind])
+    return tried[least if errors[least] < _WORTH_A_KIND * errors[now] else now], errors
 
 
-def _steps(
-    records: Sequence[Trajectory],
-    standard: Standard,
-    best: Candidate,
-    kinds: tuple[Between, ...],
-    settings: HiddenSettings,
-) -> tuple[Candidate, int]:
+def _interpolated(
+    asked: _Asked, best: Candidate, kinds: tuple[Between, ...]
+) -> tuple[Candidate, tuple[Between, ...]]:
+    """The same question asked of the best, which what inputs do may hold back by now."""
+    found, settings = [(best, kinds)], asked.settings
+    for each in asked.others(kinds).values():
+        windows, steps = asked.windows(each), settings.iterations // 2
+        other = improved(best.form, windows, best.weights, settings.decay, steps)
+        if other.error < _WORTH_A_KIND * best.error and not runs_away(other, windows):
+            found.append((replace(other, steps=best.steps), each))
+    return min(found, key=lambda candidate: candidate[0].error)
+
+
+def _steps(asked: _Asked, best: Candidate, kinds: Sequence[Between]) -> tuple[Candidate, int]:
     """Steps per sample at which rollouts are what they are at half of it."""
-    steps = 1
+    steps = asked.steps
     while steps < _MOST_STEPS:
-        finer = windows_of(records, standard, kinds, 2 * steps, settings.samples)
-        here = windows_of(records, standard, kinds, steps, settings.samples)
+        here, finer = asked.windows(kinds, steps), asked.windows(kinds, 2 * steps)
         apart = HiddenError(best.form, here).outputs(best.weights)
         apart = apart - HiddenError(best.form, finer).outputs(best.weights)
         change = np.mean(np.sum(apart**2, -1))
         if change <= _STEP_ERROR * best.error * best.form.outputs:
             break
         steps *= 2
-        best = improved(best.form, finer, best.weights, settings.decay, _FOLLOW)
+        best = improved(best.form, finer, best.weights, asked.settings.decay, _FOLLOW)
     return best, steps
 
 
@@ -335,41 +383,3 @@ def last_steps(best: Candidate, limit: int) -> int:
     if best.form.kind == "none" or not best.steps:
         return limit
     return min(limit, max(_LAST, 2 * best.steps - limit))
-
-
-def _restarted(best: Candidate, few: Windows, everything: Windows) -> Array:
-    """The same parameters with states at the starts of all windows."""
-    form = best.form
-    if len(few.y) == len(everything.y):
-        return best.weights
-    n, heads = form.states, everything.heads(_HEAD)
-    tried, errors = [], []
-    for first in behind(form, best.parameters, everything.y[:, 0]):
-        starts = np.zeros((len(first), n))
-        starts[:, : form.outputs] = first
-        weights = np.concatenate([best.parameters, starts.ravel()])
-        weights = started(form, weights, heads)
-        apart = (HiddenError(form, heads).outputs(weights) - heads.y) * heads.used[..., None]
-        tried.append(weights[form.size :].reshape(-1, n))
-        errors.append(np.sum(apart**2, axis=(1, 2)))
-    least = np.argmin(errors, axis=0)
-    return np.concatenate([best.parameters, np.array(tried)[least, np.arange(len(least))].ravel()])
-
-
-def started(form: Form, weights: Array, windows: Windows, steps: int = 12) -> Array:
-    """Weights whose states at the starts of windows fit these best, by damped Gauss-Newton."""
-    error = HiddenError(form, windows)
-    p, n = form.size, form.states
-    before = error.cost(weights)
-    for _ in range(steps):
-        JtJ, Jtr = error.normal_equations(weights)
-        change = np.zeros_like(weights)
-        for i in range(len(windows.y)):
-            at = slice(p + n * i, p + n * (i + 1))
-            change[at] = -np.linalg.solve(JtJ[at, at] + 1e-3 * np.eye(n), Jtr[at])
-        trial = weights + np.clip(change, -2, 2)
-        after = error.cost(trial)
-        if not after < before * (1 - 1e-6):
-            break
-        weights, before = trial, after
-    return weights

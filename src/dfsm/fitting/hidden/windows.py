@@ -72,6 +72,30 @@ class Windows:
             self, **cut, **{n: getattr(self, n)[:, :samples] for n in ("y", "used", "left_out")}
         )
 
+    def pieces(self, length: int) -> Windows:
+        """Windows of about so many samples that share their ends, for training alone.
+
+        `first` tells the window and sample at which each begins; where all is left out is none.
+        """
+        cuts = [
+            (i, int(a), int(b))
+            for i, there in enumerate(self.used + self.left_out)
+            for a, b in pairwise(_edges(int(np.count_nonzero(there)), length))
+            if self.used[i, a : b + 1].any()
+        ]
+        N = max(b - a for _, a, b in cuts) + 1
+        sizes = {"y": N, "h": N - 1, "v": N - 1, "used": N}
+        cut = {
+            name: np.zeros((len(cuts), size, *getattr(self, name).shape[2:]))
+            for name, size in sizes.items()
+        }
+        for k, (i, a, b) in enumerate(cuts):
+            for name, size in sizes.items():
+                count = b - a + 1 - (N - size)
+                cut[name][k, :count] = getattr(self, name)[i, a : a + count]
+        first = np.array([(i, a) for i, a, _ in cuts])
+        return Windows(**cut, left_out=np.zeros_like(cut["used"]), first=first)
+
 
 _FIELDS = ("y", "h", "v", "used", "left_out", "first")
 
