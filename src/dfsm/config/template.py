@@ -74,8 +74,9 @@ azimuth: {azimuth}
 nonlinear_only: {nonlinear_only}  # also fit the nonlinear-only model, for comparison in the report
 # Refine the derivative fit on rollouts over the training runs (null is a whole run), with latent
 # states that remember the inputs. Most accuracy and most time are here, the more the more states,
-# linear.points and runs: windows up to 100 s and 5 steps take 25 s of a processor for nine states
-# and seven runs of 600 s, what follows far longer. No further step is begun after so many seconds:
+# linear.points and runs: windows up to 100 s, 10 steps and 8 latent states take 25 s on two
+# processors for three states and 24 runs of 600 s, or nine states and seven runs; whole runs and
+# a network far longer. No further step is begun after so many seconds:
 # refine: {{windows: [20, null], step: 0.5, iterations: 20, latents: 8, network: 16, decay: 3,
 #          seconds: 600}}
 refine: {refine}
@@ -171,9 +172,22 @@ def fill(
         azimuth=_azimuth(states, varying, turbine),
         nonlinear_only="false" if turbine else "true",
         hidden=f"# {printable(advice)}\nhidden: {{}}\n" if advice else "",
-        refine=_REFINE if turbine and long and len(runs) > 1 else "null",
+        refine=_refinement(proposed) if turbine and long and len(runs) > 1 else "null",
     )
     return text, advice if states else _NO_STATE
+
+
+def _refinement(proposed: Proposal) -> str:
+    """Refinement with latent states; what controls drive would learn the controller."""
+    driving = [*proposed.disturbances, *(Feature(**f).name for f in proposed.features)]
+    # A tower swings several times as fast as a platform.
+    step = 0.25 if any(state["name"] == _TOWER for state in proposed.states) else 0.5
+    if not driving:
+        return _REFINE.format(latents="", step=step)
+    states = sum(state["order"] for state in proposed.states)
+    decay = _DECAY if states <= _FEW_STATES else _DECAY_OF_MANY
+    inputs = f"latents: 8, latent_inputs: {_flow(driving)}, decay: {decay}, "
+    return _REFINE.format(latents=inputs, step=step)
 
 
 def _hidden_told(proposed: Proposal) -> str:
@@ -238,7 +252,10 @@ _NO_CORRECTION = """\
   kind: none          # what a turbine's residuals hold is mostly what no input tells; mlp, rbf or
                       # gp learn from them, in minutes more"""
 
-_REFINE = "{windows: [20, 100], step: 0.25, iterations: 5, seconds: 90}"
+_REFINE = "{{windows: [20, 100], step: {step}, iterations: 10, {latents}seconds: 90}}"
+# How little coefficients may change: the more states, the more of them chance can use.
+_DECAY, _DECAY_OF_MANY, _FEW_STATES = 30, 1000, 5
+_TOWER = "TTDspFA"
 
 _LPV = """\
   kind: LPV           # LPV varies with the schedule; LTI does not (remove schedule, points)
