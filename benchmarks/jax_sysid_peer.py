@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import jax
@@ -18,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax_sysid.models import Model  # pyright: ignore[reportMissingImports]
 
-STATES = 6
 UNITS = 16
 SEEDS = (0, 1)
 # Chosen on the runs held out; the documentation has 0.001 and 1000.
@@ -39,21 +39,21 @@ def output(x: Any, u: Any, params: Sequence[Any]) -> Any:  # noqa: ARG001
     return x @ params[5].T + params[6]
 
 
-def first_guess(inputs: int, outputs: int, seed: int) -> list[np.ndarray]:
+def first_guess(states: int, inputs: int, outputs: int, seed: int) -> list[np.ndarray]:
     """Random parameters, of the sizes that the documentation has."""
     draw = np.random.default_rng(seed).standard_normal
     return [
-        np.hstack([0.5 * np.eye(STATES), 0.1 * draw((STATES, inputs))]),
-        np.hstack([0.1 * draw((UNITS, STATES)), 0.5 * draw((UNITS, inputs))]),
-        0.5 * draw((STATES, UNITS)),
+        np.hstack([0.5 * np.eye(states), 0.1 * draw((states, inputs))]),
+        np.hstack([0.1 * draw((UNITS, states)), 0.5 * draw((UNITS, inputs))]),
+        0.5 * draw((states, UNITS)),
         np.zeros(UNITS),
-        np.zeros(STATES),
-        0.1 * draw((outputs, STATES)),
+        np.zeros(states),
+        0.1 * draw((outputs, states)),
         np.zeros(outputs),
     ]
 
 
-def fit(u: np.ndarray, y: np.ndarray, seed: int) -> Any:
+def fit(u: np.ndarray, y: np.ndarray, states: int, seed: int) -> Any:
     """Model trained on runs (run, time, channel) of standardised signals.
 
     The runs are simulated side by side, as one system whose state holds theirs: the sum of errors
@@ -66,17 +66,17 @@ def fit(u: np.ndarray, y: np.ndarray, seed: int) -> Any:
         return v.reshape(runs, -1)
 
     together = Model(
-        runs * STATES,
+        runs * states,
         runs * outputs,
         runs * inputs,
         state_fcn=lambda x, u, th: step(split(x), split(u), th).reshape(-1),
         output_fcn=lambda x, u, th: output(split(x), split(u), th).reshape(-1),
     )
-    together.init(params=first_guess(inputs, outputs, seed))
+    together.init(params=first_guess(states, inputs, outputs, seed))
     together.loss(rho_x0=RHO, rho_th=RHO)
     together.optimization(adam_eta=RATE, adam_epochs=1000, lbfgs_epochs=LBFGS, iprint=-1)
     together.fit(*(v.swapaxes(0, 1).reshape(v.shape[1], -1) for v in (y, u)))
-    model = Model(STATES, outputs, inputs, state_fcn=step, output_fcn=output)
+    model = Model(states, outputs, inputs, state_fcn=step, output_fcn=output)
     model.init(params=together.params)
     model.loss(rho_x0=RHO, rho_th=RHO)
     return model
@@ -93,7 +93,7 @@ def predict(model: Any, u: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    """Fit from every seed, take the model best on the runs held out, predict the tests."""
+    """Fit every size from every seed; the model best on the runs held out predicts the tests."""
     data = np.load(sys.argv[1])
     begin = time.perf_counter()
     # jax-sysid would switch these on with the first model, after the first arrays.
@@ -105,8 +105,8 @@ def main() -> None:
     y, y_held, known = ((v - middle[1]) / size[1] for v in (y, y_held, known))
     start = known.shape[1] - 1
     errors, models = [], []
-    for seed in SEEDS:
-        model = fit(u[:, start:], y[:, start:], seed)
+    for states, seed in product(data["states"].tolist(), SEEDS):
+        model = fit(u[:, start:], y[:, start:], states, seed)
         predicted = [
             predict(model, *run) for run in zip(u_held, y_held[:, : start + 1], strict=True)
         ]
@@ -114,7 +114,9 @@ def main() -> None:
         truth = y_held[:, start:]
         rms = np.sqrt(np.mean((predicted - truth) ** 2, axis=1))
         errors.append(np.mean(rms / np.std(truth, axis=1)))
-        print(f"seed {seed}: {errors[-1]:.3f} on the runs held out", file=sys.stderr)
+        print(
+            f"{states} states, seed {seed}: {errors[-1]:.3f} on the runs held out", file=sys.stderr
+        )
     best = models[int(np.nanargmin(errors))]
     seconds = time.perf_counter() - begin
     predicted = [predict(best, *run) for run in zip(u_test, known, strict=True)]

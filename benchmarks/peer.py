@@ -10,7 +10,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import venv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,26 +61,38 @@ def fit_and_predict(
     tests: Sequence[dfsm.Trajectory],
 ) -> tuple[Array, float]:
     """Outputs of the tests from the start on, (run, step, output), and seconds of fitting."""
-    files = [ENVIRONMENT / name for name in ("inputs.npz", "predictions.npz")]
-    data = {}
+    data = {"states": np.array([6])}
     for name, runs in (("training", training), ("held", held), ("test", tests)):
         pairs = [resampled(run) for run in runs]
         data[f"{name}_inputs"] = np.stack([u for u, _ in pairs])
         data[f"{name}_outputs"] = np.stack([y for _, y in pairs])
     # Nothing that a test measured after the start goes along.
     data["test_outputs"] = data["test_outputs"][:, : round(WARM_UP / STEP) + 1]
-    python = environment()
-    np.savez(files[0], **data)
+    return predicted(environment(), data)
+
+
+def predicted(python: Path, data: Mapping[str, Any]) -> tuple[Array, float]:
+    """Outputs of the tests and seconds of fitting, from what `jax_sysid_peer` reads."""
+    files = [ENVIRONMENT / name for name in ("inputs.npz", "predictions.npz")]
+    np.savez(files[0], allow_pickle=False, **data)
     subprocess.run([python, "-I", SCRIPT, *files], check=True, stdout=sys.stderr)
     with np.load(files[1]) as back:
         return back["outputs"], float(back["fit_s"])
 
 
+def installed() -> Path | None:
+    """Python of the environment, if it is there."""
+    python = ENVIRONMENT / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    return python if python.exists() else None
+
+
 def environment() -> Path:
     """Python of the environment, which is made if it is not there."""
-    python = ENVIRONMENT / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
-    if not python.exists():
+    if installed() is None:
         venv.create(ENVIRONMENT, with_pip=True)
+    python = installed()
+    if python is None:
+        raise RuntimeError(f"no Python in {ENVIRONMENT}")
     # Standard output is for the figures.
     command = [python, "-m", "pip", "install", "--quiet", REQUIREMENT]
     subprocess.run(command, check=True, stdout=sys.stderr)

@@ -6,7 +6,8 @@ python -m benchmarks sysid                   twins, whose structure is the same
 Each by one call on the configuration that `dfsm init` proposes; the first 50 samples of a test
 record tell the state and are not scored. Training records of twins have noise of one hundredth of
 what is seen, their test records none: a ratio to that floor below one is a model better than the
-instrument.
+instrument. Where `python -m benchmarks peer` has made the environment of jax-sysid, a recurrent
+model of that package is trained and tested beside, on as many samples as it takes in minutes.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import peer
 from benchmarks.twins import TWINS
 from dfsm.config.fit import load_config
 from dfsm.config.template import write_config
@@ -42,14 +44,17 @@ PUBLISHED: Mapping[str, tuple[str, Sequence[str], str, float]] = {
 SEEDS, TWIN_SEEDS = (0, 1, 2, 3, 4), (0, 1, 2)
 _TOLD = 50
 _TRAIN, _TEST, _NOISE = 1000, 800, 0.01
+# Samples that train the peer, the share of them that judges its seeds, and its numbers of states.
+_PEER, _HELD, _PEER_STATES = 6000, 0.25, (2, 3, 6)
+_PEER_NAME = "jax-sysid, 16 units"
 
 
 def run(folder: str | None = None, seeds: Iterable[int] | None = None) -> dict[str, object]:
     """One row per record and seed, and a table of what they come to over the seeds."""
     if folder is not None:
-        rows = _published(Path(folder), tuple(SEEDS if seeds is None else seeds))
-        return {"table": _table(rows), "rows": rows}
-    rows = []
+        rows, peers = _published(Path(folder), tuple(SEEDS if seeds is None else seeds))
+        return {"table": _table(rows), "peers": peers, "rows": rows}
+    rows, peers = [], list[dict[str, object]]()
     with tempfile.TemporaryDirectory() as place:
         for name, twin in TWINS.items():
             train = Path(place) / f"{name}.csv"
@@ -59,7 +64,8 @@ def run(folder: str | None = None, seeds: Iterable[int] | None = None) -> dict[s
             floor = {"floor": _NOISE * float(record["y"].std())}
             for seed in TWIN_SEEDS if seeds is None else seeds:
                 rows.append(_row(name, train, tests, (twin.unit, 1.0), seed) | floor)
-    return {"table": _table(rows), "rows": rows}
+            peers += _peers(name, record, tests, (twin.unit, 1.0))
+    return {"table": _table(rows), "peers": peers, "rows": rows}
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
@@ -81,8 +87,10 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
     return table
 
 
-def _published(folder: Path, seeds: Sequence[int]) -> list[dict[str, object]]:
-    rows = []
+def _published(
+    folder: Path, seeds: Sequence[int]
+) -> tuple[list[dict[str, object]], list[dict[str, object]]]:
+    rows, peers = list[dict[str, object]](), list[dict[str, object]]()
     for name, (train, tests, unit, factor) in PUBLISHED.items():
         missing = [f for f in (train, *tests) if not (folder / f).exists()]
         if missing:
@@ -92,7 +100,35 @@ def _published(folder: Path, seeds: Sequence[int]) -> list[dict[str, object]]:
             )
         records = {Path(f).stem: read(folder / f) for f in tests}
         rows += [_row(name, folder / train, records, (unit, factor), seed) for seed in seeds]
-    return rows
+        peers += _peers(name, read(folder / train), records, (unit, factor))
+    return rows, peers
+
+
+def _peers(
+    name: str, train: Trajectory, tests: Mapping[str, Trajectory], unit: tuple[str, float]
+) -> list[dict[str, object]]:
+    """The error of a recurrent model of jax-sysid, where that is installed."""
+    python = peer.installed()
+    if python is None:
+        return []
+    train = train if len(train) <= _PEER else train.window(None, float(train.time[_PEER - 1]))
+    last = round(len(train) * (1 - _HELD))
+    longest = max(map(len, tests.values()))
+    data = {"states": np.array(_PEER_STATES)}
+    for kind, channel in (("inputs", "u"), ("outputs", "y")):
+        values = train[channel][None, :, None]
+        data[f"training_{kind}"], data[f"held_{kind}"] = values[:, :last], values[:, last:]
+        each = [np.pad(r[channel], (0, longest - len(r)), mode="edge") for r in tests.values()]
+        data[f"test_{kind}"] = np.array(each)[:, :, None]
+    data["test_outputs"] = data["test_outputs"][:, : _TOLD + 1]
+    outputs, seconds = peer.predicted(python, data)
+    errors = {}
+    for (test, record), values in zip(tests.items(), outputs, strict=True):
+        apart = values[: len(record) - _TOLD, 0] - record["y"][_TOLD:]
+        errors[test] = unit[1] * float(np.sqrt(np.mean(apart**2)))
+    return [
+        {"record": name, "peer": _PEER_NAME, "unit": unit[0], "rmse": errors, "seconds": seconds}
+    ]
 
 
 def _row(

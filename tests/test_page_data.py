@@ -101,8 +101,8 @@ def test_the_first_screen_tells_the_verdict_and_every_warning_once(validation, t
     assert "usable: q; for trends only: v, y." in verdict({"half": half})
     many = {f"m{k}": half for k in range(3)} | {"good": validation}
     assert (
-        "Of 12 signals of 4 fitted models, 6 usable and 6 for trends only; all of good are usable"
-        in verdict(many)
+        "Of 12 signals of 4 fitted models, 6 usable and 6 for trends only; "
+        "every signal of good is usable" in verdict(many)
     )
     box = cautions({"a": validation, "b": validation})
     assert box.count("<li>") == len(validation.warnings)

@@ -261,7 +261,7 @@ class _Rows:
         if key not in self._products:
             self._products[key] = late @ self.table, np.zeros(len(now))
         products, before = self._products[key]
-        for other in np.flatnonzero(now != before):
+        for other in np.flatnonzero(now != before).tolist():
             products[:, other] = late @ self._late(other, now[other : other + 1])[0]
         before[:] = now
         return products

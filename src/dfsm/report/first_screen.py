@@ -58,7 +58,7 @@ def verdict(validations: Mapping[str, Validation]) -> Markup:
     counts = [f"{every.count(g)} {g}" for g in GRADES if g in every]
     best = [name for name, of in found if of and set(of.values()) == {"usable"}]
     told = f"Of {len(every)} signals of {plural(len(found), 'fitted model')}, {listed(counts)}"
-    told += f"; all of {listed(best)} are usable." if best else "."
+    told += f"; every signal of {listed(best)} is usable." if best else "."
     return element("p", told, cls="verdict")
 
 

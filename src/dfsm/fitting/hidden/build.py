@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dfsm.data.dataset import Dataset
+from dfsm.data.periods import period
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.fitting.hidden.assembled import assembled
@@ -89,6 +90,9 @@ def fit_hidden(model: DFSM, data: Dataset, settings: FitSettings, hidden: Hidden
     found = search(records, len(s.states), s.between_samples(), free, hidden, settings.seed)
     built = assembled(model, found, startup)
     notes, checks = _told(found, hidden, [n for n, f in zip(s.exogenous, free, strict=True) if f])
+    periods = [period(r, s.exogenous) for r in records]
+    if all(periods):
+        checks[0] += f", under inputs that training saw, too: {_repeated(periods)}"
     checks += _instruments(found, s.names("states"))
     record = {
         "hidden": {
@@ -200,6 +204,15 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
             "with half as many, what the integration adds would be learned"
         )
     return _doubts(found, hidden), checks
+
+
+def _repeated(periods: Sequence[float | None]) -> str:
+    ends = sorted(p for p in periods if p is not None)
+    told = dict.fromkeys(f"{p:.3g}" for p in (ends[0], ends[-1]))
+    return (
+        f"they repeat themselves every {' to '.join(told)} s, so only a record under other inputs "
+        "tells how good the model is (dfsm validate)"
+    )
 
 
 def _instruments(found: Found, names: Sequence[str]) -> list[str]:

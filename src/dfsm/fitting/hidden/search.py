@@ -164,7 +164,7 @@ class _Asked:
         """By what inputs that nobody named may do instead, what all inputs do then."""
         if not any(self.open_kinds):
             return {}
-        each = {
+        each: dict[Between, tuple[Between, ...]] = {
             kind: tuple(kind if free else k for k, free in zip(kinds, self.open_kinds, strict=True))
             for kind in get_args(Between)
         }
