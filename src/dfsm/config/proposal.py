@@ -38,7 +38,7 @@ _TURBINE = {*_SECOND_ORDER, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
 # RMS that is left of the rate of a state, and of a second derivative that nobody recorded, above
 # which a state is not to be told by derivatives alone: the latter are less sure on coarse samples.
 _CLEAR, _CLEAR_TWICE = 0.22, 0.1
-# States of order 2 with unmeasured rates up to which rates are told as hidden states.
+# Most states of a system whose unmeasured rates are told as hidden states.
 _MOST_RATES = 3
 _MOST_CHANNELS = 60
 

@@ -122,16 +122,16 @@ class Windows:
     def swing(self, name: str) -> float:
         """Time in s that a channel takes for a swing, by its second derivative over its first.
 
-        Over windows of the length at which noise is next to nothing.
+        Over windows of the length at which noise is next to nothing; inf where it does not swing.
         """
         column = self.names.index(name)
         span, _ = self.span(column, 2)
         first, second = (np.var(self.rows(o, span).change[:, column]) for o in (1, 2))
-        tiny = np.finfo(float).tiny
-        return float(2 * np.pi * np.sqrt(first / max(second, tiny)))
+        rate = float(np.sqrt(second / max(first, np.finfo(float).tiny)))
+        return 2 * np.pi / rate if rate > 0 else np.inf
 
     def per_swing(self, name: str) -> float:
-        """Such windows per swing."""
+        """Windows of that length per swing."""
         span, _ = self.span(self.names.index(name), 2)
         return self.swing(name) / (span * self.usual)
 

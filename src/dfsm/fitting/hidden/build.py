@@ -196,7 +196,8 @@ def _told(found: Found, hidden: HiddenSettings, free: list[str]) -> tuple[list[s
         listed = ", ".join(f"{k} {np.sqrt(v):.3g}" for k, v in found.kinds_tried.items())
         kind = found.kinds[0] if len({*found.kinds}) == 1 else "as told"
         checks.append(
-            f"{', '.join(free)} between samples: {listed}; {kind} was taken (inputs sets another)"
+            f"{', '.join(free)} between samples: {listed} with the simplest equation; {kind} was "
+            "taken (inputs sets another)"
         )
     if found.steps > 1:
         checks.append(

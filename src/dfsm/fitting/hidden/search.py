@@ -40,12 +40,13 @@ from dfsm.models.corrective.polynomial import REACH
 _WORTH_A_STATE, _WORTH_A_KIND, _STEP_ERROR = 0.7, 0.95, 0.01
 # What instruments make of outputs must lower that of linear systems to this.
 _WORTH_A_SENSOR = 0.7
-# Linear systems whose squared error is no more than so many times the least may be enough.
-_NEARLY = 2.0
-# A start that leaves more than this share of the linear system's squared error leads nowhere. One
-# that leaves less and runs away is right about the record and wrong beyond: nothing mends that.
-# What leaves so little is left as it is.
-_LEADS, _ENOUGH = 0.5, 0.05
+# Linear systems whose squared error is no more than so many times the least, or than this of a
+# record without noise, may be enough.
+_NEARLY, _NOTHING = 2.0, 1e-8
+# A start that leaves more than this share of the squared error of a linear system that is poor
+# leads nowhere. One that leaves less and runs away is right about the record and wrong beyond:
+# nothing mends that.
+_LEADS, _POOR = 0.5, 0.2
 # Most steps per sample, and radians of a swing up to which one is enough to begin with.
 _MOST_STEPS, _PER_STEP = 8, 1.0
 # The polynomial and some draws of tanh units go first.
@@ -228,7 +229,8 @@ def _promising(
     """
     known = [c for c in sorted(linear) if np.isfinite(linear[c].error)]
     least = min(linear[c].error for c in known)
-    first = next(c for c in known if linear[c].error <= _NEARLY * least)
+    enough = max(_NEARLY * least, _NOTHING)
+    first = next(c for c in known if linear[c].error <= enough)
     fewer = [c for c in reversed(known) if c < first]
     if fewer and settings.form != "none":
         least = _simplest(linear[first], windows, settings)
@@ -253,7 +255,7 @@ def _from(
     """Where a nonlinear start leads; by way of short windows where it leads nowhere at once."""
     weights = nonlinear_start(linear, form, draw)
     found = improved(form, windows, weights, settings.decay, settings.iterations)
-    if found.error <= max(_LEADS * linear.error, _ENOUGH):
+    if linear.error <= _POOR or found.error <= _LEADS * linear.error:
         return found
     weights = from_short_windows(form, weights, windows, settings.decay)
     again = improved(form, windows, weights, settings.decay, settings.iterations)
@@ -278,6 +280,8 @@ def _ascended(
         if best is not None and first.error > _WORTH_A_STATE * best.error:
             break
         best, others = first, (linear[count], candidates, tasks[_SCOUTS:])
+        if first.error <= _NOTHING:
+            break
     if best is None or others is None:
         raise ValueError("no number of hidden states to try")
     start, scouts, tasks = others
