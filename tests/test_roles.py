@@ -228,3 +228,23 @@ def test_short_records_and_ramps_are_looked_at(count: int) -> None:
     found = proposed(recorded(columns, time))
     roles = [*orders(found), *found.controls, *found.disturbances, *found.outputs]
     assert sorted(roles) == ["ramp", "x", "z"]
+
+
+def test_an_input_of_two_values_has_powers_that_rest() -> None:
+    """Their products with other channels tell nothing new, and do no harm."""
+    time = np.arange(0, 200, 0.1)
+    force = np.sign(np.sin(2 * np.pi * time / 20 + 0.1))
+    at = lambda t: force[min(int(t / 0.1 + 1e-9), len(force) - 1)]  # noqa: E731
+    f = lambda x, t: [  # noqa: E731
+        x[2],
+        x[3],
+        -3 * x[0] + 2 * x[1] - 0.2 * x[2] + at(t),
+        2 * x[0] - 2 * x[1] - 0.2 * x[3],
+    ]
+    x = marched(f, [0.0] * 4, time)
+    noise = 0.01 * x.std(axis=0) * np.random.default_rng(0).standard_normal(x.shape)
+    x = x + noise
+    columns = {"Force (N)": force, "x1 (m)": x[:, 0], "x2 (m)": x[:, 1]}
+    found = proposed(recorded(columns, time))
+    assert found.controls == ["Force"]
+    assert set(orders(found)) == {"x1", "x2"}

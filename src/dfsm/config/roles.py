@@ -40,6 +40,8 @@ _CLEARLY = 4.0
 # Products and powers are tried for so many channels, of this degree, with so many samples for each;
 # those of a rate on so many blocks of the records, as angles go on into what no other run has seen.
 _BENT, _DEGREE, _SAMPLES, _BLOCKS = 7, 3, 20, 40
+# Spread below which a power rests, relative to its largest value.
+_RESTS = 1e-9
 # Highest power of one channel alone.
 _HIGHEST = 5
 # Samples per swing, or windows where noise has to be averaged out, below which a second derivative
@@ -367,8 +369,10 @@ def _left_on_others(target: Array, inputs: Array, blocks: int = 2) -> float:
     """Share of a variance that a fit on every second block leaves in the others, and back."""
     if len(target) < 2 * _SAMPLES * inputs.shape[1] or not np.ptp(target) > 0:
         return 1.0
-    size = np.maximum(inputs.std(axis=0), np.finfo(float).tiny)
-    X = np.column_stack([inputs / size, np.ones(len(target))])
+    size = inputs.std(axis=0)
+    # Powers of what has two values rest, but for rounding.
+    moves = size > _RESTS * np.abs(inputs).max(axis=0)
+    X = np.column_stack([inputs[:, moves] / size[moves], np.ones(len(target))])
     second = np.arange(len(target)) * blocks // len(target) % 2 == 1
     squares = 0.0
     for taught in (second, ~second):
