@@ -25,6 +25,7 @@ from dfsm.core.types import Array
 NAME = "jax-sysid, 6 states, 16 units (a general peer)"
 SCRIPT = Path(__file__).with_name("jax_sysid_peer.py")
 ENVIRONMENT = Path(__file__).parents[1] / "build" / "jax_sysid"
+PYTHON = ENVIRONMENT / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
 REQUIREMENT = "jax-sysid==1.1.0"
 INPUTS = ("GenTq", "BldPitch1", "RotWind", "RotShearV", "RotShearH", "Wave1Elev")
 OUTPUTS = ("PtfmPitch", "GenSpeed")
@@ -68,35 +69,26 @@ def fit_and_predict(
         data[f"{name}_outputs"] = np.stack([y for _, y in pairs])
     # Nothing that a test measured after the start goes along.
     data["test_outputs"] = data["test_outputs"][:, : round(WARM_UP / STEP) + 1]
-    return predicted(environment(), data)
+    install()
+    return predicted(data)
 
 
-def predicted(python: Path, data: Mapping[str, Any]) -> tuple[Array, float]:
+def predicted(data: Mapping[str, Any]) -> tuple[Array, float]:
     """Outputs of the tests and seconds of fitting, from what `jax_sysid_peer` reads."""
     files = [ENVIRONMENT / name for name in ("inputs.npz", "predictions.npz")]
     np.savez(files[0], allow_pickle=False, **data)
-    subprocess.run([python, "-I", SCRIPT, *files], check=True, stdout=sys.stderr)
+    subprocess.run([PYTHON, "-I", SCRIPT, *files], check=True, stdout=sys.stderr)
     with np.load(files[1]) as back:
         return back["outputs"], float(back["fit_s"])
 
 
-def installed() -> Path | None:
-    """Python of the environment, if it is there."""
-    python = ENVIRONMENT / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
-    return python if python.exists() else None
-
-
-def environment() -> Path:
-    """Python of the environment, which is made if it is not there."""
-    if installed() is None:
+def install() -> None:
+    """Make the environment if it is not there."""
+    if not PYTHON.exists():
         venv.create(ENVIRONMENT, with_pip=True)
-    python = installed()
-    if python is None:
-        raise RuntimeError(f"no Python in {ENVIRONMENT}")
     # Standard output is for the figures.
-    command = [python, "-m", "pip", "install", "--quiet", REQUIREMENT]
+    command = [PYTHON, "-m", "pip", "install", "--quiet", REQUIREMENT]
     subprocess.run(command, check=True, stdout=sys.stderr)
-    return python
 
 
 def resampled(run: dfsm.Trajectory) -> tuple[Array, Array]:

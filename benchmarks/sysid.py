@@ -108,8 +108,7 @@ def _peers(
     name: str, train: Trajectory, tests: Mapping[str, Trajectory], unit: tuple[str, float]
 ) -> list[dict[str, object]]:
     """The error of a recurrent model of jax-sysid, where that is installed."""
-    python = peer.installed()
-    if python is None:
+    if not peer.PYTHON.exists():
         return []
     train = train if len(train) <= _PEER else train.window(None, float(train.time[_PEER - 1]))
     last = round(len(train) * (1 - _HELD))
@@ -121,7 +120,7 @@ def _peers(
         each = [np.pad(r[channel], (0, longest - len(r)), mode="edge") for r in tests.values()]
         data[f"test_{kind}"] = np.array(each)[:, :, None]
     data["test_outputs"] = data["test_outputs"][:, : _TOLD + 1]
-    outputs, seconds = peer.predicted(python, data)
+    outputs, seconds = peer.predicted(data)
     errors = {}
     for (test, record), values in zip(tests.items(), outputs, strict=True):
         apart = values[: len(record) - _TOLD, 0] - record["y"][_TOLD:]

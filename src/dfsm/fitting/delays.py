@@ -220,6 +220,7 @@ class _Rows:
         self._shifted: dict[tuple[int, tuple[float, ...]], Array] = {}
         # Products of a column at many lags with all columns, and the lags that these had.
         self._products: dict[tuple[int, tuple[float, ...]], tuple[Array, Array]] = {}
+        # Products of all columns with each other, and the lags that they had.
         self._known = b"", np.zeros((0, 0))
 
     def left(self, lags: Mapping[int, float]) -> float:
@@ -239,13 +240,14 @@ class _Rows:
         gram, right, whole = gram[np.ix_(others, others)], gram[others, -1], gram[-1, -1]
         scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         inverse = np.linalg.pinv(gram / np.outer(scale, scale), _RANK, hermitian=True)
-        own = products[:, others] / scale
-        by_others = inverse @ (right / scale)
+        own, right = products[:, others] / scale, right / scale
+        by_others = inverse @ right
         size = np.sum(self._late(column, tried) ** 2, axis=1)
         rest = size - np.einsum("li,ij,lj->l", own, inverse, own)
         more = products[:, -1] - own @ by_others
-        gain = np.where(rest > _RANK * size, more**2, 0.0) / np.where(rest > _RANK * size, rest, 1)
-        share = (whole - (right / scale) @ by_others - gain) / whole
+        free = rest > _RANK * size
+        gain = np.where(free, more**2 / np.where(free, rest, 1.0), 0.0)
+        share = (whole - right @ by_others - gain) / whole
         return np.maximum(share, _ROUNDING) * whole / len(self.table)
 
     def _lags(self, lags: Mapping[int, float]) -> Array:

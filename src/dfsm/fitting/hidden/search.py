@@ -161,15 +161,14 @@ class _Asked:
         most = self.settings.samples
         return windows_of(self.records, self.standard, kinds, steps or self.steps, most)
 
-    def others(self, kinds: tuple[Between, ...]) -> dict[Between, tuple[Between, ...]]:
-        """By what inputs that nobody named may do instead, what all inputs do then."""
+    def kinds_of_all(self, kinds: Sequence[Between]) -> dict[Between, tuple[Between, ...]]:
+        """By what inputs that nobody named may do, what all inputs do then."""
         if not any(self.open_kinds):
             return {}
-        each: dict[Between, tuple[Between, ...]] = {
+        return {
             kind: tuple(kind if free else k for k, free in zip(kinds, self.open_kinds, strict=True))
             for kind in get_args(Between)
         }
-        return {kind: all_kinds for kind, all_kinds in each.items() if all_kinds != kinds}
 
 
 def _first_steps(records: Sequence[Trajectory], outputs: int) -> int:
@@ -338,16 +337,16 @@ def _interpolation(
     A nonlinear start tells, the simplest there is: beside what a linear system leaves over, what
     inputs do between samples may be little.
     """
-    others = asked.others(kinds)
-    if not others:
+    tried = asked.kinds_of_all(kinds)
+    if not tried:
         return kinds, {}
     now = next(k for k, free in zip(kinds, asked.open_kinds, strict=True) if free)
-    tried = {kind: others.get(kind, kinds) for kind in get_args(Between)}
-    errors: dict[str, float] = {
+    errors: dict[Between, float] = {
         kind: _simplest(linear, asked.windows(each), asked.settings) for kind, each in tried.items()
     }
-    least = min(tried, key=lambda kind: errors[kind])
-    return tried[least if errors[least] < _WORTH_A_KIND * errors[now] else now], errors
+    least = min(errors.items(), key=lambda item: item[1])[0]
+    taken = least if errors[least] < _WORTH_A_KIND * errors[now] else now
+    return tried[taken], {**errors}
 
 
 def _interpolated(
@@ -355,7 +354,9 @@ def _interpolated(
 ) -> tuple[Candidate, tuple[Between, ...]]:
     """The same question asked of the best, which what inputs do may hold back by now."""
     found, settings = [(best, kinds)], asked.settings
-    for each in asked.others(kinds).values():
+    for each in asked.kinds_of_all(kinds).values():
+        if each == kinds:
+            continue
         windows, steps = asked.windows(each), settings.iterations // 2
         other = improved(best.form, windows, best.weights, settings.decay, steps)
         if other.error < _WORTH_A_KIND * best.error and not runs_away(other, windows):

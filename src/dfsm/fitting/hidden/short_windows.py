@@ -50,9 +50,8 @@ def from_short_windows(form: Form, weights: Array, windows: Windows, decay: floa
         found = improved(form, pieces, np.concatenate([p, starts.ravel()]), decay, steps)
         p = found.parameters
         along = HiddenError(form, pieces).paths(found.weights)
-        for states, taken, i, a in zip(along, pieces.used, window, sample, strict=True):
-            count = min(len(taken), paths.shape[1] - a)
-            paths[i, a : a + count] = states[:count]
+        for states, i, a in zip(along, window, sample, strict=True):
+            paths[i, a : a + len(states)] = states[: paths.shape[1] - a]
     return np.concatenate([p, paths[:, 0].ravel()])
 
 
