@@ -161,7 +161,7 @@ class _Asked:
         most = self.settings.samples
         return windows_of(self.records, self.standard, kinds, steps or self.steps, most)
 
-    def kinds_of_all(self, kinds: Sequence[Between]) -> dict[Between, tuple[Between, ...]]:
+    def kinds_of_all(self, kinds: Sequence[Between]) -> dict[str, tuple[Between, ...]]:
         """By what inputs that nobody named may do, what all inputs do then."""
         if not any(self.open_kinds):
             return {}
@@ -341,12 +341,13 @@ def _interpolation(
     if not tried:
         return kinds, {}
     now = next(k for k, free in zip(kinds, asked.open_kinds, strict=True) if free)
-    errors: dict[Between, float] = {
+    errors = {
         kind: _simplest(linear, asked.windows(each), asked.settings) for kind, each in tried.items()
     }
-    least = min(errors.items(), key=lambda item: item[1])[0]
-    taken = least if errors[least] < _WORTH_A_KIND * errors[now] else now
-    return tried[taken], {**errors}
+    # In the order of `tried`, so that the first of equals is taken.
+    least = list(tried.values())[int(np.argmin(list(errors.values())))]
+    clear = min(errors.values()) < _WORTH_A_KIND * errors[now]
+    return least if clear else tried[now], errors
 
 
 def _interpolated(
