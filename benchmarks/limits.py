@@ -24,7 +24,7 @@ from benchmarks import scheduled
 from benchmarks.accuracy import bundled
 from benchmarks.rollouts import errors, low_passed, uncorrected
 from dfsm.core.types import Array
-from dfsm.refinement.rollout_error import record_of
+from dfsm.refinement.record import record_of
 
 SEEDS = (2, 4)  # training seeds per wind speed, instead of eight
 UNITS = (0, 16, 32)  # of the network

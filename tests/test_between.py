@@ -18,7 +18,7 @@ from dfsm.fitting.fit import fit
 from dfsm.fitting.settings import FitSettings
 from dfsm.models.model_folder import load, save
 from dfsm.numerics.time_mesh import same_instant, weights_over_time
-from dfsm.refinement.rollout_error import record_of
+from dfsm.refinement.record import record_of
 from dfsm.simulation.simulate import SimulationSettings, simulate
 from dfsm.validation.validate import validate
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +22,11 @@ from dfsm.errors import DfsmError, hushed
 from dfsm.models.latents import at_rest
 from dfsm.models.terms import RotorTerm
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.record import record_of
+from dfsm.refinement.rollout_error import ErrorWeights, RolloutError
+from dfsm.refinement.slopes import state_matrix
 from dfsm.refinement.start import start_latents
+from dfsm.refinement.windows import start_slopes, starts, windows_of
 from systems import cost_slopes, wander
 
 TABLE = dfsm.read_rotor_table(
@@ -279,6 +283,47 @@ def test_slopes_agree_with_differences(model, runs, length):
     _, Jtr = problem.normal_equations(at)
     slopes = cost_slopes(problem, at)
     np.testing.assert_allclose(2 * Jtr, slopes, rtol=1e-4, atol=1e-5 * np.abs(slopes).max())
+
+
+def test_slopes_at_the_starts_are_nearly_those_of_the_starts(model, runs):
+    """Of latent pairs and of the wakes that they change, through all the record before a window."""
+    record = record_of(model, runs[0], 0.5, 0.0, 30.0)
+    wide = start_latents(model, [record], 2, np.array([0.05]))
+    parameters = Parametrization.of(wide, np.array([0.05]))
+    windows = windows_of(record, 15.0, wakes=True)
+    at = jnp.asarray(0.003 * np.random.default_rng(0).normal(size=parameters.size))
+    exact = jax.jit(jax.jacfwd(lambda w: starts(parameters.at(w), windows)))(at)
+    pairs, marched = eqx.filter_jit(start_slopes)(parameters, at, windows)
+    found = np.zeros(exact.shape)
+    found[:, :3] = marched
+    found[:, 3:, parameters.latent_columns[0]] = pairs[:, 0]
+    assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
+    assert np.abs(exact[1, 1:3]).max() > 0.1
+
+
+def test_slopes_in_the_states_written_out_are_those_of_the_model(model, runs):
+    scheduled = replace(
+        model,
+        f=replace(
+            model.f,
+            schedule=model.signals.state_columns.start,
+            grid=jnp.array([4.0, 8.0]),
+            coefficients=jnp.concatenate([model.f.coefficients, 1.1 * model.f.coefficients]),
+            offsets=jnp.concatenate([model.f.offsets, model.f.offsets + 0.1]),
+        ),
+    )
+    record = record_of(model, runs[0], 0.5, 0.0, 30.0)
+    for one in (model, scheduled):
+        inputs = jnp.asarray(record.inputs_at(one)[::7])
+        marched = one.signals.marched
+
+        def rates(x, others, one=one, marched=marched):
+            return one.derivative(x, *others)[:marched]
+
+        for at in inputs:
+            x, *others = one.split(at)
+            exact = jax.jacfwd(rates)(x, others)
+            np.testing.assert_allclose(state_matrix(one, at), exact, rtol=1e-10, atol=1e-12)
 
 
 def test_the_lag_is_learnt_from_rollouts(model, runs):

@@ -20,7 +20,8 @@ from dfsm.data.readers.tables import write_table
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.record import record_of
+from dfsm.refinement.rollout_error import ErrorWeights, RolloutError
 from dfsm.refinement.start import start_latents
 from systems import cost_slopes, wander
 

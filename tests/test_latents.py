@@ -28,8 +28,9 @@ from dfsm.models.latents import Poles, as_states, evolve, latent_path, poles, wi
 from dfsm.models.model_folder import load, load_all, save
 from dfsm.models.signals import Provenance
 from dfsm.refinement.parameters import Parametrization
+from dfsm.refinement.record import record_of
 from dfsm.refinement.refine import refine
-from dfsm.refinement.rollout_error import ErrorWeights, RolloutError, record_of
+from dfsm.refinement.rollout_error import ErrorWeights, RolloutError
 from dfsm.refinement.settings import RefineSettings
 from dfsm.simulation.simulate import Status, initial_state, simulate
 from dfsm.validation.validate import compared, validate

@@ -28,7 +28,7 @@ from dfsm.fitting.settings import FitSettings
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
 from dfsm.models.signals import Azimuth
-from dfsm.refinement.rollout_error import record_of
+from dfsm.refinement.record import record_of
 from dfsm.selection.trial import Course
 from dfsm.simulation.simulate import initial_state, simulate
 from dfsm.simulators.start import as_signal

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -89,19 +90,48 @@ def wakes_along(
     Array
         Shape ``(step + 1, induced velocity)``.
     """
-    s, paths = model.signals, list[jax.Array]()
+    s = model.signals
     none = jnp.zeros((len(states), s.induced))
     x = jnp.concatenate([states, none, pairs], axis=1)
     inputs = model.join(x, *s.order.split_exogenous(exogenous))
-    for rotor in _lagging(model):
-        settled, lags = jax.vmap(rotor.wake)(inputs)
+    return wakes_following(model, h, jax.vmap(partial(wake_targets, model))(inputs))
+
+
+def wake_targets(model: DFSM, inputs: jax.Array) -> jax.Array:
+    """What the wake of every rotor settles to in m/s, and its slow lag in s, ``(rotor, 2)``.
+
+    At one input vector, shape ``(input,)``.
+    """
+    return jnp.array([rotor.wake(inputs) for rotor in _lagging(model)]).reshape(-1, 2)
+
+
+def wakes_following(model: DFSM, h: jax.Array | float, targets: jax.Array) -> jax.Array:
+    """Induced velocities that follow `wake_targets`, settled at first.
+
+    Parameters
+    ----------
+    model
+        The surrogate.
+    h
+        Steps in s, ``(step,)``, or one for all.
+    targets
+        At their ends, ``(step + 1, rotor, 2)``.
+
+    Returns
+    -------
+    Array
+        Shape ``(step + 1, induced velocity)``.
+    """
+    paths = list[jax.Array]()
+    for rotor, target in zip(_lagging(model), jnp.moveaxis(targets, 1, 0), strict=True):
+        settled, lags = target[:, 0], target[:, 1]
         slow = _following(settled, lags, h)
         if rotor.about.lags > 1:
             k = share_at_once(rotor.pace, rotor.about.lags)
             quick = quickness(rotor.pace) * lags
             paths.append(_following(k * settled + (1 - k) * slow, quick, h))
         paths.append(slow)
-    return jnp.stack(paths, axis=1) if paths else jnp.zeros((len(inputs), 0))
+    return jnp.stack(paths, axis=1) if paths else jnp.zeros((len(targets), 0))
 
 
 def _following(target: jax.Array, lags: jax.Array, h: jax.Array | float) -> jax.Array:

@@ -90,6 +90,12 @@ class Parametrization(eqx.Module):
         return first + np.concatenate([dynamics.T, *drive], axis=1)
 
     @property
+    def term_columns(self) -> slice:
+        """Where the parameters of terms lie in the vector."""
+        first = sum(int(np.prod(shape)) for shape in self._shapes[:4])
+        return slice(first, first + sum(int(np.prod(shape)) for shape in self._term_shapes))
+
+    @property
     def _shapes(self) -> list[tuple[int, ...]]:
         points, rows = len(self.model.f.grid), len(self.rows)
         pairs = len(self.model.signals.pairs) // 2
@@ -189,13 +195,8 @@ class Parametrization(eqx.Module):
         first, states = len(model.signals.inputs), model.signals.marched
 
         def at_one(inputs: jax.Array) -> jax.Array:
-            def values(parts: list[jax.Array]) -> jax.Array:
-                moved = self._terms(parts)
-                return jnp.zeros(0) if moved is None else moved(inputs)
-
-            # Backwards: a term has few values and dozens of parameters.
-            by_part = jax.jacrev(values)(terms)
-            J = jnp.concatenate([p.reshape(p.shape[0], -1) for p in by_part], axis=1)
+            known = self.model.terms
+            J = jnp.zeros((0, 0)) if known is None else known.parameter_slopes(terms, inputs)
             L, _ = model.f.at(inputs[model.f.schedule or 0])
             return L[:states, first:] @ J
 

@@ -7,12 +7,12 @@ training runs follow the record,
 
     min_w  Σ_windows Σ_t |(ξ̂(t; w) - ξ(t)) / σ|² ,
 
-with exact forward sensitivities through the integrator and Levenberg-Marquardt. Windows grow stage
-by stage: over short ones a poor start does no harm, over long ones slow errors show. Runs held out
-of the training decide when to stop, and a model that is no better on them is not handed out. Then
-they are learnt from, too: as many steps as the last stage took follow on all runs. Where runs are
-held out several times, others each time, all runs are learnt from at last, from the start and with
-as many steps per stage as were best in the median.
+with exact gradients through the integrator and Levenberg-Marquardt. Windows grow stage by stage:
+over short ones a poor start does no harm, over long ones slow errors show. Runs held out of the
+training decide when to stop, and a model that is no better on them is not handed out. Then they are
+learnt from, too: as many steps as the last stage took follow on all runs. Where runs are held out
+several times, others each time, all runs are learnt from at last, from the start and with as many
+steps per stage as were best in the median.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from dfsm.models.corrective import Perceptron
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import Poles, add_latents, as_states
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.rollout_error import Record
+from dfsm.refinement.record import Record
 
 # Poles lie between a thirtieth of the records and some steps of the refinement.
 _SLOWEST, _FASTEST = 30.0, 7.0

@@ -18,7 +18,8 @@ from dfsm.models.dfsm import DFSM
 from dfsm.numerics.levenberg_marquardt import LevenbergMarquardt, Step
 from dfsm.refinement.growth import StabilityKept
 from dfsm.refinement.parameters import Parametrization
-from dfsm.refinement.rollout_error import ErrorWeights, Record, RolloutError, record_of
+from dfsm.refinement.record import Record, record_of
+from dfsm.refinement.rollout_error import ErrorWeights, RolloutError
 from dfsm.refinement.settings import RefineSettings
 from dfsm.refinement.start import start_latents, start_network
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.types import Array
@@ -70,6 +71,58 @@ class Term(eqx.Module):
     def staged(self) -> Term:
         """The term in the form in which `of_numbers` is fastest; it cannot be saved."""
         return self
+
+    def effective(self, signals: jax.Array) -> jax.Array:
+        """The numbers through which alone the signals act, ``(signal,)`` to ``(number,)``.
+
+        The signals themselves, unless a term knows fewer: its slopes then cost less.
+        """
+        return signals
+
+    def of_effective(self, numbers: jax.Array) -> jax.Array:
+        """The values at what `effective` gives, ``(number,)`` to ``(value,)``."""
+        return self.values(numbers)
+
+    def slopes(self, inputs: jax.Array) -> jax.Array:
+        """∂φ/∂I at one input vector, ``(input,)`` to ``(value, input)``."""
+        signals = jnp.stack([inputs[column] for column in self.columns])
+        by_number = jax.jacrev(self.of_effective)(self.effective(signals))
+        by_signal = by_number @ jax.jacrev(self.effective)(signals)
+        none = jnp.zeros((len(self.channels), inputs.shape[0]))
+        return none.at[:, np.array(self.columns, dtype=int)].add(by_signal)
+
+    def parameter_slopes(self, deviations: Sequence[jax.Array], inputs: jax.Array) -> jax.Array:
+        """∂φ/∂θ at one input vector.
+
+        Parameters
+        ----------
+        deviations
+            Of the term's `parameters`, as `moved` takes them.
+        inputs
+            I, ``(input,)``.
+
+        Returns
+        -------
+        Array
+            Shape ``(value, parameter)``, parameters in the order of `parameters`.
+        """
+        if not deviations:
+            return jnp.zeros((len(self.channels), 0))
+        signals = jnp.stack([inputs[column] for column in self.columns])
+
+        def effective(theta: list[jax.Array]) -> jax.Array:
+            return self.moved(theta).effective(signals)
+
+        def values(numbers: jax.Array, theta: list[jax.Array]) -> jax.Array:
+            return self.moved(theta).of_effective(numbers)
+
+        theta = list(deviations)
+        # Backwards: a term has few values and dozens of parameters.
+        by_number, direct = jax.jacrev(values, (0, 1))(effective(theta), theta)
+        through = jax.jacrev(effective)(theta)
+        parts = zip(direct, through, strict=True)
+        flat = [a.reshape(len(a), -1) + by_number @ b.reshape(len(b), -1) for a, b in parts]
+        return jnp.concatenate(flat, axis=1)
 
     # -- other terms made of it -----------------------------------------------------------------
 

@@ -149,8 +149,17 @@ class RotorTerm(Term):
 
         With lags the rates of the induced velocity's states in m/s² come after them.
         """
+        return self.of_effective(self.effective(signals))
+
+    def effective(self, signals: jax.Array) -> jax.Array:
+        """Wind, speed and pitch as `inflow` tells them, and the induced velocity's states."""
         first = self._induced
-        return self.felt(self.inflow(signals), signals[first : first + self.about.lags])
+        induced = signals[first : first + self.about.lags]
+        return jnp.concatenate([jnp.stack(self.inflow(signals)), induced])
+
+    def of_effective(self, numbers: jax.Array) -> jax.Array:
+        """As `values`."""
+        return self.felt((numbers[0], numbers[1], numbers[2]), numbers[3:])
 
     def felt(self, inflow: tuple[jax.Array, jax.Array, jax.Array], induced: jax.Array) -> jax.Array:
         """The values at what `inflow` tells and the induced velocity's states, ``(lags,)``."""

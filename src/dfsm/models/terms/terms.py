@@ -71,6 +71,20 @@ class Terms(eqx.Module):
         """Values at many input vectors, shape ``(sample, input)`` to ``(sample, value)``."""
         return np.asarray(_along(self, from_host(inputs)))
 
+    def slopes_at(self, inputs: jax.Array) -> jax.Array:
+        """∂φ/∂I at one input vector, ``(input,)`` to ``(value, input)``; JAX can follow it."""
+        none = jnp.zeros((0, inputs.shape[0]))
+        return jnp.concatenate([none, *(part.slopes(inputs) for part in self.parts)])
+
+    def parameter_slopes(self, deviations: Sequence[jax.Array], inputs: jax.Array) -> jax.Array:
+        """∂φ/∂θ at one input vector, ``(value, parameter)``, see `moved`."""
+        rows, first = list[jax.Array](), 0
+        for part in self.parts:
+            last = first + len(part.parameters)
+            rows.append(part.parameter_slopes(deviations[first:last], inputs))
+            first = last
+        return jax.scipy.linalg.block_diag(*rows)
+
     def slopes(self, inputs: Array) -> Array:
         """∂φ/∂I at many input vectors, ``(sample, input)`` to ``(sample, value, input)``."""
         return np.asarray(_slopes(self, from_host(inputs)))
@@ -172,4 +186,4 @@ def _along(terms: Terms, inputs: jax.Array) -> jax.Array:
 
 @eqx.filter_jit
 def _slopes(terms: Terms, inputs: jax.Array) -> jax.Array:
-    return jax.vmap(jax.jacfwd(terms))(inputs)
+    return jax.vmap(terms.slopes_at)(inputs)
