@@ -117,19 +117,19 @@ def settings(
     )
 
 
-# Chosen on training runs held out, with as few steps as keep the demo short. What is remembered is
-# wind and waves alone, not the controller's answer to them, so that the model holds for others.
+# What is remembered is wind and waves alone, not the controller's answer to them, so that the model
+# holds for others.
 REFINEMENT = dfsm.RefineSettings(
     windows=(20.0, None),
     step=0.5,
-    iterations=10,
+    iterations=25,
     latents=8,
     latent_inputs=(
         *("RotWind", "RotShearV", "RotShearH", "Wave1Elev", "Wave1Elev_dot"),
         *(f"{ring}-RotWind" for ring in RINGS),
         *(feature.name for feature in AHEAD),
     ),
-    decay=3.0,
+    decay=6.0,
 )
 
 
