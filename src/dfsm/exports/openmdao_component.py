@@ -112,7 +112,7 @@ def variables_of(model: DFSM) -> dict[str, str]:
     s = model.signals
     wanted = {c.name: _plain(c.name) for c in (*_all(model), *s.outputs)}
     wanted |= {f"d {c.name}/dt": f"d_{_plain(c.name)}_dt" for c in s.states}
-    taken = set(_OF_DYMOS)
+    taken: set[str] = set(_OF_DYMOS)
     for key, name in wanted.items():
         while name in taken:
             name += "_"
