@@ -80,6 +80,8 @@ def test_an_export_driven_with_them_is_the_rollout(tmp_path, monkeypatch, dfsm):
     said = dfsm("export", "inputs", *files[:2], "-o", files[2], "--start", 1, "--stop", 58)
     assert said.code == 0, said
     assert "571 samples of force, wave_dot, wave_delay1, wave_lead2" in " ".join(said.out.split())
+    said = dfsm("export", "state-space", files[0], "-o", tmp_path / "plant.json")
+    assert "note: wave_dot (m/s) is the time derivative of wave: supply it" in said.out
     taken = read(tmp_path / "in.csv")
     light, start = Model(tmp_path / "light" / "model.npz"), [0.3, -0.1]
     driven = (taken.select(light.names(g)).values for g in ("controls", "disturbances"))

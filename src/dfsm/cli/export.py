@@ -33,6 +33,7 @@ def state_space(
     quiet: Quiet = False,
 ) -> None:
     """Linearizations at steady states: .mat for MATLAB and Simulink, or .json."""
+    from dfsm.exports.functions import computed_inputs
     from dfsm.exports.state_space import check_suffix, to_state_space
     from dfsm.models.model_folder import load
 
@@ -44,7 +45,7 @@ def state_space(
     for point in () if quiet else made:
         where = "" if made.schedule is None else f"{made.schedule.name} = {point.schedule:.4g}: "
         say(lines(f"{where}{point.message}"), quiet)
-    say(lines(f"wrote {output}: {len(made)} linearizations"), quiet)
+    _tell(f"{output}: {len(made)} linearizations", list(computed_inputs(loaded).values()), quiet)
 
 
 @exports.command()
