@@ -130,7 +130,9 @@ def by_dymos(model: dfsm.DFSM) -> dict[str, Any]:
         phase.add_state(target, rate_source=rate, targets=[target], units=unit,
                         fix_initial=True, fix_final=True)  # fmt: skip
     phase.add_state("J", rate_source="L", units=None, fix_initial=True)
-    phase.add_control(named["u"], targets=[named["u"]], units="N", lower=-LIMIT, upper=LIMIT)
+    # The optimum leaves its bound with a kink, which dymos would forbid between segments.
+    phase.add_control(named["u"], targets=[named["u"]], units="N", lower=-LIMIT, upper=LIMIT,
+                      rate_continuity=False)  # fmt: skip
     phase.add_objective("J", loc="final")
     problem = om.Problem(reports=False)
     trajectory = dymos.Trajectory()

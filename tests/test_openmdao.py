@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import exported
 import fits
 from systems import linear_model
 
@@ -62,6 +65,26 @@ def test_what_cannot_depend_has_no_entry():
     model = linear_model(A, B, np.array([[3.0, 0.0]]), names=["q", "v"])
     expected = [[False, True, False], [True, True, True], [True, False, False]]
     np.testing.assert_array_equal(dependence(model), expected)
+
+
+def test_a_term_depends_on_what_it_takes_alone():
+    from dfsm.exports.openmdao_component import dependence
+
+    model = exported.whole()
+    depends = dependence(replace(model, e=None, corrected=()))
+    names = [c.name for group in ("states", "controls", "disturbances", "parameters")
+             for c in getattr(model.signals, group)]  # fmt: skip
+    rate = depends[2]  # of heave_dot: wave, heave, its rate, RotSpeed·heave² and drag
+    taken = {name for name, used in zip(names, rate, strict=True) if used}
+    assert taken == {"eta_dot", "heave <z>", "heave <z>_dot", "RotSpeed"}
+
+
+def test_a_rate_of_a_number_is_per_second():
+    from dfsm.exports.openmdao_component import _rate
+
+    assert {u: _rate(u) for u in ("-", "1", "m", "")} == {
+        "-": "1/s", "1": "1/s", "m": "m/s", "": None,
+    }  # fmt: skip
 
 
 def test_names_and_units_are_those_that_openmdao_takes():

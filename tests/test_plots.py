@@ -14,18 +14,22 @@ import dfsm
 import fits
 from dfsm.control.mesh.grid import Grid
 from dfsm.control.solution import Ending, Solution
+from dfsm.core.drawing import Shown
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.loops.adaptive import AdaptiveResult, Agreement, Realised, Round
 from dfsm.loops.load_cases import Figures
 from dfsm.loops.sweep import Sweep, Swept
+from dfsm.loops.trust_region import Confirmation, ConfirmedTuning
 from dfsm.loops.tuning_result import TuneStatus, TuningResult
 from dfsm.models.summary import lines_of
+from dfsm.refinement.refine import RefineResult
 from dfsm.report.result_figures import extremes
 from dfsm.selection.compare import RankedCandidate, Ranking
 from dfsm.selection.trial import Outcome
 from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus
 from dfsm.simulation.simulate import Status
+from dfsm.validation.closed_loop import ClosedLoopValidation
 from dfsm.validation.intervals import Intervals
 
 TIME = np.linspace(0, 4, 9)
@@ -257,6 +261,30 @@ def test_notebooks_show_a_verdict_and_a_table_and_no_figure(validation):
     wide = Trajectory(TIME, np.ones((9, 300)), tuple(Channel(f"c{i}") for i in range(300)))
     assert "and 285 rows more" in wide._repr_html_()
     assert len(wide.plot().data) == 12
+
+
+def test_what_is_printed_of_a_result_is_a_sentence(validation):
+    listed = [solution(), tuned(), validation, *comparisons()]
+    listed.append(ClosedLoopValidation((Channel("q"),), ()))
+    listed.append(ConfirmedTuning(next(iter(Confirmation)), (), 0, None))
+    steps = tuple({"stage": 1.0, "training": 0.2} for _ in range(300))
+    listed.append(RefineResult(fits.linear().model, True, 0.2, 0.1, steps, (), "refined"))
+    for result in listed:
+        said = repr(result)
+        assert said.startswith(f"<{type(result).__name__}"), said
+        assert len(said) < 500, said
+    sweep, _, adaptive = comparisons()
+    assert repr(sweep) == "<Sweep: 2 controllers over 1 run; table() has their figures>"
+    assert "best of 2 rounds is number 2, objective 2.5;" in repr(adaptive)
+    assert "objective 2, before 4;" in repr(tuned())
+
+
+def test_results_that_notebooks_show_have_a_line_of_their_own():
+    public = [getattr(dfsm, name) for name in dfsm.__all__ if name != "__version__"]
+    shown = [c for c in public if isinstance(c, type) and issubclass(c, Shown)]
+    assert len(shown) > 9
+    # What a dataclass makes for itself prints every number of every run.
+    assert [c for c in shown if hasattr(c.__repr__, "__wrapped__")] == []
 
 
 def test_a_model_is_told_in_eighty_columns():

@@ -243,6 +243,10 @@ def test_the_page_holds_every_series_and_the_figures_every_limit(
         "problems were solved."
     )
     best = {r.most_pitch: r.power for r in found.results if r.case.key == "b"}
+    # A telephone's first screen holds them and the figure.
+    assert len(article.lede + " ".join(article.sections[0].paragraphs)) < 200
+    asked = " ".join(article.sections[1].paragraphs)
+    assert f"{best[7.0]:.2f} MW with Θp,max = 7 deg" in asked
     (curve,) = next(p for p in power.panels if p.title == "case b").curves
     assert dict(zip(curve.x, curve.y, strict=True)) == best
     for figure in others:

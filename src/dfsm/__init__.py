@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from dfsm.models.model_folder import load, load_all, save
     from dfsm.models.signals import Azimuth
     from dfsm.models.steady import SteadyState, steady_state
+    from dfsm.models.taken import model_inputs
     from dfsm.models.terms import Function, Product, QuadraticDrag, Rotor
     from dfsm.refinement.refine import RefineResult, refine
     from dfsm.refinement.settings import RefineSettings
@@ -149,6 +150,7 @@ _HOME = {
     "Function": "models.terms",
     "Azimuth": "models.signals",
     "DFSM": "models.dfsm",
+    "model_inputs": "models.taken",
     "SteadyState": "models.steady",
     "steady_state": "models.steady",
     "Discon": "controllers.discon",

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from dfsm.cli.targets import check_spared
-from dfsm.cli.terminal import Quiet, lines, say
+from dfsm.cli.terminal import Quiet, SampleStepAlone, as_in_fit, lines, say, tell_notes, working
 
 exports = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="A model in the files of other programs."
@@ -33,6 +33,7 @@ def state_space(
     quiet: Quiet = False,
 ) -> None:
     """Linearizations at steady states: .mat for MATLAB and Simulink, or .json."""
+    from dfsm.exports.functions import computed_inputs
     from dfsm.exports.state_space import check_suffix, to_state_space
     from dfsm.models.model_folder import load
 
@@ -44,7 +45,7 @@ def state_space(
     for point in () if quiet else made:
         where = "" if made.schedule is None else f"{made.schedule.name} = {point.schedule:.4g}: "
         say(lines(f"{where}{point.message}"), quiet)
-    say(lines(f"wrote {output}: {len(made)} linearizations"), quiet)
+    _tell(f"{output}: {len(made)} linearizations", list(computed_inputs(loaded).values()), quiet)
 
 
 @exports.command()
@@ -113,3 +114,33 @@ def fmu(
         else f"a binary for {made.binary}"
     )
     _tell(f"{output} ({what})", made.notes, quiet)
+
+
+@exports.command()
+def inputs(
+    model: Model,
+    run: Annotated[str, typer.Argument(help="File of the run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet or CSV file to write.")],
+    start: Annotated[float | None, typer.Option(help="Start in s; default the run's.")] = None,
+    stop: Annotated[float | None, typer.Option(help="End in s; default the run's.")] = None,
+    sample_step: SampleStepAlone = None,
+    quiet: Quiet = False,
+) -> None:
+    """What a model takes of a run, computed inputs among it: a table to drive an export with."""
+    from dfsm.core.fallback import write_or_keep
+    from dfsm.core.files import check_file
+    from dfsm.data.readers import read
+    from dfsm.data.readers.tables import table_suffix, write_table
+    from dfsm.models.model_folder import load
+    from dfsm.models.taken import model_inputs
+
+    table_suffix(output)
+    check_file(output)
+    loaded = load(model)
+    check_spared([output], model, loaded, [run], sample_step)
+    with working(quiet):
+        (recorded,) = as_in_fit(loaded, [read(run, sample_step)])
+        tell_notes([recorded], quiet)
+        table = model_inputs(loaded, recorded, start=start, stop=stop)
+    write_or_keep(lambda path: write_table(table, path), output)
+    say(lines(f"wrote {output}: {len(table)} samples of {', '.join(table.names)}"), quiet)

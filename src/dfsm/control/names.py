@@ -105,7 +105,7 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
         The model is something else, JAX cannot follow it, or a control acts late in it.
     """
     if isinstance(model, DFSM):
-        _require_prompt_controls(model)
+        require_prompt_controls(model)
         channels = {g: tuple(getattr(model.signals, g)) for g in GROUPS.values()}
         ready = model.prepared()
         point = partial(Point, ready)
@@ -125,7 +125,14 @@ def plant_of(model: DFSM | ODESystem) -> Plant:
     return Plant(channels, f, g, partial(_SystemPoint, f, g), None)
 
 
-def _require_prompt_controls(model: DFSM) -> None:
+def require_prompt_controls(model: DFSM) -> None:
+    """Refuse a model that takes what a control did some time ago.
+
+    Raises
+    ------
+    DfsmError
+        Which input of which control.
+    """
     late = acting_late(model.signals.features, model.signals.names("controls"))
     if late:
         feature, control = next(iter(late.items()))

@@ -8,7 +8,7 @@ which OpenMDAO takes by default, would be nearly a per cent off for a torque of 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -17,11 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dfsm.control.names import require_prompt_controls
 from dfsm.core.host import from_host
 from dfsm.core.types import Array
 from dfsm.core.units import conversion, listed, powers
 from dfsm.data.channel import Channel
 from dfsm.errors import DfsmError
+from dfsm.exports.functions import computed_inputs, starting_values
 from dfsm.models.dfsm import DFSM
 
 try:
@@ -34,13 +36,17 @@ except ImportError:
     raise DfsmError("this needs OpenMDAO: pip install 'dfsm[openmdao]'") from None
 
 _GROUPS = ("states", "controls", "disturbances", "parameters")
+# What dymos connects to its own clock wherever an input bears the name, or keeps for itself.
+_OF_DYMOS = ("t", "time", "t_phase", "time_phase", "t_initial", "t_duration")
 
 
 class DFSMComp(om.ExplicitComponent):
     """The derivatives and outputs of a model at many nodes.
 
     Options: ``model``, a `DFSM`, and ``num_nodes``. Inputs are the states, controls and
-    disturbances, of shape ``(num_nodes,)``, and the parameters, of shape ``(1,)``. Outputs are
+    disturbances, of shape ``(num_nodes,)``, and the parameters, of shape ``(1,)``, which start in
+    the middle of the training data; an input that dfsm would compute from others says so in its
+    description, and `dfsm.model_inputs` computes it. Outputs are
     ``d_NAME_dt`` for every state and the model's outputs. Units are those of the model where
     OpenMDAO knows them, and none elsewhere. Characters that OpenMDAO does not take in names become
     ``_``; `variables` tells what each signal is called. Harmonics of a rotor's azimuth are at their
@@ -60,12 +66,11 @@ class DFSMComp(om.ExplicitComponent):
     def setup(self) -> None:
         """Declare variables and the sparsity of their partial derivatives."""
         model, nodes = self.options["model"], self.options["num_nodes"]
-        s, named = model.signals, self.variables
+        s, named, at = model.signals, self.variables, _at_start(model)
         for group in _GROUPS:
             shape = (1,) if group == "parameters" else (nodes,)
-            for c, middle in zip(getattr(s, group), _middles(model, group), strict=True):
-                units = unit_of(c.unit)
-                self.add_input(named[c.name], val=float(middle), shape=shape, units=units)
+            for c in getattr(s, group):
+                self.add_input(named[c.name], shape=shape, units=unit_of(c.unit), **at[c.name])
         rows = [*((f"d {c.name}/dt", _rate(c.unit)) for c in s.states)]
         rows += [(c.name, unit_of(c.unit)) for c in s.outputs]
         for key, units in rows:
@@ -107,7 +112,7 @@ def variables_of(model: DFSM) -> dict[str, str]:
     s = model.signals
     wanted = {c.name: _plain(c.name) for c in (*_all(model), *s.outputs)}
     wanted |= {f"d {c.name}/dt": f"d_{_plain(c.name)}_dt" for c in s.states}
-    taken: set[str] = set()
+    taken: set[str] = set(_OF_DYMOS)
     for key, name in wanted.items():
         while name in taken:
             name += "_"
@@ -177,8 +182,10 @@ def dependence(model: DFSM) -> Array:
         L = np.asarray(linear.coefficients)
         used = (L != 0).any(axis=0)
         depends = used[:, : len(s.inputs)].copy()
-        # A known term may take any signal, and so may a correction.
-        depends |= used[:, len(s.inputs) :].any(axis=1, keepdims=True)
+        last = len(s.inputs)
+        for part in () if model.terms is None else model.terms.parts:
+            first, last = last, last + len(part.channels)
+            depends[:, list(part.columns)] |= used[:, first:last].any(axis=1, keepdims=True)
         if corrective is not None:
             depends[list(corrected)] = True
         if linear.schedule is not None:
@@ -195,9 +202,12 @@ def dymos_phase(model: DFSM, transcription: Any) -> Any:
     """Return a dymos phase whose equations are the model.
 
     States, controls and disturbances (as controls that nobody optimizes) and parameters are
-    declared with their units; give bounds, scales and what is optimized with the phase's
-    ``set_state_options`` and ``set_control_options``. A bound on a control holds at the nodes: the
-    polynomial between them may pass it, so look at a fine mesh or use more segments.
+    declared with their units and values in the middle of the training data; give bounds, scales
+    and what is optimized with the phase's ``set_state_options`` and ``set_control_options``, and
+    the course of the disturbances with ``set_control_val``, from `dfsm.model_inputs` over the times
+    of the phase: dymos stretches the times that it is given to the phase, whatever they are. A
+    bound on a control holds at the nodes: the polynomial between them may pass it, so look at a
+    fine mesh or use more segments.
 
     Parameters
     ----------
@@ -209,25 +219,29 @@ def dymos_phase(model: DFSM, transcription: Any) -> Any:
     Raises
     ------
     DfsmError
-        dymos is not installed.
+        dymos is not installed, or an input of the model is what a control did some time ago.
     """
     try:
         import dymos  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DfsmError("this needs dymos: pip install 'dfsm[openmdao]'") from None
+    require_prompt_controls(model)
     phase = dymos.Phase(
         ode_class=DFSMComp, ode_init_kwargs={"model": model}, transcription=transcription
     )
-    s, named = model.signals, variables_of(model)
+    s, named, at = model.signals, variables_of(model), _at_start(model)
     for c in s.states:
         name, rate = named[c.name], named[f"d {c.name}/dt"]
-        phase.add_state(name, rate_source=rate, targets=[name], units=unit_of(c.unit))
+        phase.add_state(
+            name, rate_source=rate, targets=[name], units=unit_of(c.unit), val=at[c.name]["val"]
+        )
     for c in (*s.controls, *s.disturbances):
-        name = named[c.name]
-        phase.add_control(name, targets=[name], units=unit_of(c.unit), opt=c in s.controls)
+        name, chosen = named[c.name], c in s.controls
+        units = unit_of(c.unit)
+        phase.add_control(name, targets=[name], units=units, opt=chosen, **at[c.name])
     for c in s.parameters:
-        name = named[c.name]
-        phase.add_parameter(name, targets=[name], units=unit_of(c.unit), static_target=True)
+        name, units = named[c.name], unit_of(c.unit)
+        phase.add_parameter(name, targets=[name], units=units, static_target=True, **at[c.name])
     for c in s.outputs:
         phase.add_timeseries_output(named[c.name], units=unit_of(c.unit))
     return phase
@@ -254,8 +268,14 @@ def _all(model: DFSM) -> list[Channel]:
     return [c for group in _GROUPS for c in getattr(model.signals, group)]
 
 
-def _middles(model: DFSM, group: str) -> Iterable[float]:
-    return np.asarray(model.region.mean)[model.signals.order.columns(group)].tolist()
+def _at_start(model: DFSM) -> dict[str, dict[str, Any]]:
+    """Start values and descriptions by signal, as OpenMDAO and dymos take them."""
+    starts, computed = starting_values(model), computed_inputs(model)
+    return {
+        c.name: {"val": float(value), "desc": computed.get(c.name, c.label)}
+        for group in _GROUPS
+        for c, value in zip(getattr(model.signals, group), starts[group], strict=True)
+    }
 
 
 def _plain(name: str) -> str:
@@ -265,4 +285,7 @@ def _plain(name: str) -> str:
 
 def _rate(unit: str) -> str | None:
     known = unit_of(unit)
-    return None if known is None else unit_of(f"{known}/s")
+    if known is None:
+        # Of a number that has no unit; nothing is said of a unit that OpenMDAO does not know.
+        return "1/s" if listed(unit) and not powers(unit) else None
+    return unit_of(f"{known}/s")

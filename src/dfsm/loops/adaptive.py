@@ -148,6 +148,12 @@ class AdaptiveResult(Shown):
     runs: tuple[Trajectory, ...]
     simulations: int
 
+    def __repr__(self) -> str:
+        return (
+            f"<AdaptiveResult: best of {len(self.rounds)} rounds is number {self.best + 1}, "
+            f"objective {self.solution.objective:.5g}; {self.message}>"
+        )
+
     @property
     def message(self) -> str:
         """One sentence on the outcome."""

@@ -150,6 +150,11 @@ class Sweep(Drawn):
     weights: tuple[float, ...]
     units: Mapping[str, str]
 
+    def __repr__(self) -> str:
+        made = f"{len(self.controllers)} controller{'s' * (len(self.controllers) != 1)}"
+        runs = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
+        return f"<Sweep: {made} over {runs}; table() has their figures>"
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values: all figures."""
         values = {

@@ -120,6 +120,12 @@ class ConfirmedTuning:
     best: int
     controller: Any
 
+    def __repr__(self) -> str:
+        return (
+            f"<ConfirmedTuning: best of {len(self.flights)} flights is number {self.best + 1}; "
+            f"{self.status.value}>"
+        )
+
     @property
     def values(self) -> dict[str, float]:
         """Parameters of the best flight."""

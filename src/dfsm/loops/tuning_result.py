@@ -13,6 +13,7 @@ from dfsm.controllers.discon import Value
 from dfsm.core.drawing import DrawnByRun
 from dfsm.core.files import json_value
 from dfsm.core.types import Array
+from dfsm.errors import printable
 from dfsm.loops.tuning_problem import TuningProblem
 from dfsm.models.departures import MUCH_OUTSIDE, told
 from dfsm.simulation.closed_loop import ClosedLoopRun
@@ -123,6 +124,13 @@ class TuningResult(DrawnByRun):
     evaluations: int
     gradients: int
     seconds: float
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{name} = {value:.4g}" for name, value in self.values.items())
+        return (
+            f"<TuningResult: {printable(found)}; objective {self.objective:.5g}, before "
+            f"{self.before_objective:.5g}; {self.message}>"
+        )
 
     @property
     def at_bounds(self) -> list[str]:

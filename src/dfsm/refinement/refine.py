@@ -29,7 +29,7 @@ from dfsm.core.renamed import renamed
 from dfsm.data.dataset import Dataset
 from dfsm.data.hold_out import checked, divisions
 from dfsm.data.trajectory import Trajectory
-from dfsm.errors import DfsmWarning
+from dfsm.errors import DfsmWarning, printable
 from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import with_latent_range
 from dfsm.models.signals import Provenance
@@ -70,6 +70,9 @@ class RefineResult:
     ended: tuple[str, ...]
     message: str
     splits: tuple[tuple[float, float], ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<RefineResult: {printable(self.message)}; {len(self.history)} steps>"
 
 
 # One thread for each product of matrices: several runs are at work already.

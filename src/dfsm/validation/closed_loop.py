@@ -107,6 +107,13 @@ class ClosedLoopValidation(DrawnByRun):
     channels: tuple[Channel, ...]
     runs: tuple[ClosedLoopComparison, ...]
 
+    def __repr__(self) -> str:
+        loops = f"{len(self.runs)} closed loop{'s' * (len(self.runs) != 1)}"
+        return (
+            f"<ClosedLoopValidation: {self.completed} of {loops} completed, "
+            f"{len(self.channels)} channels; to_pandas() compares them with the records>"
+        )
+
     @property
     def completed(self) -> int:
         """Number of closed loops that came to their end."""
