@@ -2,7 +2,7 @@
 
 python -m benchmarks [derivatives] [field] [accuracy] [speed] [parameters] [scaling] [rollouts]
     [unseen] [waves] [limits] [intervals] [matched] [control] [codesign] [loops] [tuning] [exports]
-    [sysid] [peer] [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
+    [hidden] [sysid] [peer] [dymos] [gpu] [fuzz] [kill] [feedback] [memory]
 
 Without names all but `sysid`, which fits with five seeds (``sysid --data FOLDER`` for published
 records), `peer` and `dymos`, which make environments of their own and install jax-sysid and dymos
@@ -35,6 +35,7 @@ from benchmarks import (
     field,
     fuzz,
     gpu,
+    hidden_turbine,
     install,
     intervals,
     kill,
@@ -77,6 +78,7 @@ PARTS: dict[str, Callable[..., object]] = {
     "loops": loops.run,
     "tuning": tuning.run,
     "exports": exports.run,
+    "hidden": hidden_turbine.run,
     "sysid": sysid.run,
     "peer": peer.run,
     "dymos": dymos_peer.run,
@@ -120,6 +122,7 @@ def main() -> None:
             "startup": startup.startup_table,
             "memory": memory.memory_table,
             "install": install.install_table,
+            "hidden": hidden_turbine.hidden_turbine_table,
         }
         if name in tables:
             print("\n".join(tables[name](figures[name])), file=sys.stderr)
