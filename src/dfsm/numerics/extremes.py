@@ -94,8 +94,10 @@ def extrapolated(
     wide = np.maximum(scale, 1e-12 * np.maximum(np.abs(location), 1.0))
 
     def rare(x: float) -> float:
-        # 1 - exp(-e), accurate where it is tiny.
-        return float(w @ -np.expm1(-np.exp(-(x - location) / wide))) - 1 / blocks
+        # 1 - exp(-e), accurate where it is tiny; far below a narrow one nothing is rare.
+        with np.errstate(over="ignore"):
+            above = -np.expm1(-np.exp(-(x - location) / wide))
+        return float(w @ above) - 1 / blocks
 
     low = float((location - 20 * wide).min())
     high = float((location + (np.log(blocks) + 50) * wide).max())
@@ -103,7 +105,8 @@ def extrapolated(
         return float(location.max()), 0.0
     x = float(brentq(rare, low, high, xtol=1e-12 * max(abs(low), abs(high), 1e-300)))  # pyright: ignore[reportArgumentType]
     y = (x - location) / wide
-    density = w * np.exp(-y - np.exp(-y)) / wide
+    with np.errstate(over="ignore"):
+        density = w * np.exp(-y - np.exp(-y)) / wide
     # dx = Σ density (d location + y d scale) / Σ density.
     share = density / density.sum()
     a, b, c = _VARIANCE
