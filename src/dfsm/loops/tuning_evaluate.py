@@ -135,10 +135,14 @@ class Evaluator:
     def keep(self, journal: Path) -> None:
         """Take over what a journal holds, one evaluation a line, and add to it from now on."""
         if journal.exists():
-            lines = journal.read_text(encoding="utf-8").splitlines()[1:]
-            for line in lines:
+            text = journal.read_text(encoding="utf-8", errors="replace")
+            for line in text.splitlines()[1:]:
                 if (found := _from_line(line)) is not None:
                     self._know(found)
+            if text and not text.endswith("\n"):
+                # The line in whose middle a process was ended; the next begins one of its own.
+                with journal.open("a", encoding="utf-8") as stream:
+                    stream.write("\n")
         self._journal = journal
 
     def __call__(self, theta: Array, slopes: bool = False) -> Figured:

@@ -48,8 +48,15 @@ def block_maxima(time: Series, values: Series, block: float) -> Array:
     Raises
     ------
     DfsmError
-        There are fewer than five whole blocks.
+        There are fewer than five whole blocks, or blocks without samples.
     """
+    # An interval of the mesh that is longer than a block leaves one without samples.
+    longest = float(np.diff(time).max())
+    if block < longest * (1 - 1e-9):
+        raise DfsmError(
+            f"blocks of {block:g} s hold no sample where samples are {longest:g} s apart: take "
+            "longer blocks"
+        )
     count = int((time[-1] - time[0]) / block * (1 + 1e-9))
     if count < _FEWEST:
         raise DfsmError(
