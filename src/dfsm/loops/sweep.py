@@ -258,7 +258,7 @@ def sweep(
         require_shares(weights)
     cases = LoadCases.of(weights, conditions)
     s = model.signals
-    units = {c.name: c.unit for c in (*s.states, *s.controls, *s.outputs)}
+    units = {c.name: c.unit for c in (*s.observed, *s.controls, *s.outputs)}
     named = [n for n in (settings.power, settings.speed, *settings.extremes) if n is not None]
     if lost := [n for n in named if n not in units]:
         raise DfsmError(f"settings: the model has {missing(lost, units)}")

@@ -43,13 +43,16 @@ class SweptLoop:
     maxima: Mapping[str, Array]
 
     @classmethod
-    def of(cls, loop: ClosedLoopRun, extremes: Sequence[str], block: float) -> SweptLoop:
-        """All that is asked of it: figures, and maxima of blocks of so many s."""
+    def of(
+        cls, loop: ClosedLoopRun, names: Sequence[str], extremes: Sequence[str], block: float
+    ) -> SweptLoop:
+        """All that is asked of it: figures of channels, and maxima of blocks of so many s."""
         run = loop.trajectory
         span = (float(run.time[0]), float(run.time[-1]))
         if loop.status is not LoopStatus.COMPLETED:
             return cls(span, f"{run.name}: {loop.message}", None, {})
-        return cls(span, None, case_figures(run), channel_maxima(run, extremes, block))
+        maxima = channel_maxima(run, extremes, block)
+        return cls(span, None, case_figures(run.select(names)), maxima)
 
     @classmethod
     def read(cls, values: Mapping[str, Any]) -> SweptLoop:

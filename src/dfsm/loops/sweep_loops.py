@@ -63,10 +63,12 @@ class SweepLoops:
         known: Mapping[tuple[int, int], SweptLoop],
         keep: Callable[[tuple[int, int], SweptLoop], None],
     ) -> list[list[SweptLoop]]:
-        s = self.settings
+        s, signals = self.settings, self.model.signals
+        # Latent states have no unit to be told in.
+        names = [c.name for c in (*signals.observed, *signals.controls, *signals.outputs)]
 
         def reduced(loop: ClosedLoopRun, at: tuple[int, int]) -> SweptLoop:
-            found = SweptLoop.of(loop, s.extremes, s.block)
+            found = SweptLoop.of(loop, names, s.extremes, s.block)
             keep(at, found)
             return found
 
