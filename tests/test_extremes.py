@@ -76,3 +76,12 @@ def test_the_command_sweeps_gains_over_load_cases(here, dfsm, fitted):
     ):
         write_config(Path("bad.yaml"), config | change)
         assert sentence in dfsm("sweep", "bad.yaml", "-o", "out").sentence
+
+
+def test_a_condition_in_which_hardly_anything_moves_changes_nothing_far_above_it():
+    wide = Gumbel(location=1.0, scale=0.1, maxima=9)
+    still = Gumbel(location=-4.0, scale=1e-13, maxima=9)
+    alone, _ = extrapolated([wide], [0.5], 1e6)
+    found, error = extrapolated([still, wide], [0.5, 0.5], 1e6)
+    assert found == pytest.approx(alone, rel=1e-9)
+    assert 0 < error < 1

@@ -13,7 +13,7 @@ import pytest
 from dfsm.data.trajectory import Channel
 from dfsm.models.corrective.gaussian_units import GaussianUnits
 from dfsm.models.dfsm import DFSM
-from dfsm.models.linear import LinearModel
+from dfsm.models.linear import LinearModel, SplitLinear
 from dfsm.models.staged import staged
 from dfsm.models.terms import Product
 from dfsm.models.terms.form import Schedule
@@ -74,6 +74,36 @@ def test_a_staged_model_is_the_same_function(points):
     if points == 1:
         many = fast.derivative(x, u, w)
         np.testing.assert_allclose(many, expected[0], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("points", [1, 5])
+@pytest.mark.parametrize(("few", "moving"), [(0.1, 0.3), (0.1, 0.0), (1.0, 0.5), (1.0, 1.0)])
+def test_coefficients_that_are_zero_or_the_same_along_the_schedule_are_told_apart(
+    points, few, moving
+):
+    shape = (points, 9, 50)
+    L = np.where(RNG.random(shape[1:]) < few, RNG.normal(size=shape[1:]), 0.0) * np.ones(shape)
+    L = np.where((L != 0) & (RNG.random(shape[1:]) < moving), L + RNG.normal(size=shape), L)
+    L[:, 4] = 0.0
+    grid = jnp.cumsum(jnp.asarray(RNG.uniform(0.5, 2, points)))
+    offsets = jnp.asarray(RNG.normal(size=shape[:2]))
+    linear = LinearModel(grid, jnp.asarray(L), offsets, None if points == 1 else 0)
+    order = RNG.permutation(50)
+    split = SplitLinear.of(linear, order[:25].tolist(), order[25:].tolist())
+    inputs = RNG.normal(size=(40, 50))
+    inputs[:, 0] = RNG.uniform(float(grid[0]) - 1, float(grid[-1]) + 1, 40)
+    way = RNG.normal(size=50)
+
+    def apart(row):
+        return split(row[order[:25]], row[order[25:]], row[0])
+
+    def both(f):
+        return jax.jit(jax.vmap(lambda row: jax.jvp(f, (row,), (way,))))(inputs)
+
+    np.testing.assert_allclose(both(apart), both(linear), rtol=1e-12, atol=1e-12)
+    # Few are written out one by one, many are a matrix.
+    many = (split.first.same, split.first.along)[int(points > 1 and moving == 1)]
+    assert (many.entries is None) == (few == 1)
 
 
 @pytest.mark.parametrize("lags", [False, True])

@@ -163,6 +163,19 @@ def test_the_optimum_is_that_of_a_grid_and_limits_hold(tmp_path):
     assert "std of q is" in lost.message
 
 
+def test_a_line_that_was_cut_off_costs_no_other(tmp_path):
+    journal, points = tmp_path / "evaluations.jsonl", np.array([[0.1, 0.1], [0.2, 0.1], [0.3, 0.1]])
+    journal.write_text("{}\n")
+    for count, computed in ((2, 2), (3, 2), (3, 0)):
+        evaluator = task().evaluator
+        evaluator.keep(journal)
+        for theta in points[:count]:
+            evaluator(theta)
+        assert evaluator.evaluations == computed
+        if count == 2:
+            journal.write_text(journal.read_text()[:-9])
+
+
 def test_what_does_not_fit_is_told_in_one_sentence():
     for changes, sentence in (
         ({"parameters": {"kp": (1.0, 0.0)}}, r"bounds of kp is \(1.0, 0.0\)"),

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from dfsm.report.article import Article
 
 _FIGURES, _TABLE, _PAGE = "sweep.json", "sweep.csv", "sweep.html"
+# Grows by a line with every loop.
+_JOURNAL = "loops.jsonl"
 
 
 def sweep(
@@ -28,24 +30,26 @@ def sweep(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Close the loop with many gains over many runs: energy, loads, travel, extremes."""
+    """Close the loop with many gains over many runs: energy, loads; goes on where it was ended."""
     from dfsm.cli.tables import print_article
     from dfsm.config.sweep import load_sweep
     from dfsm.core.bundle import check_no_bundle
     from dfsm.core.fallback import write_or_keep
     from dfsm.core.files import check_together
+    from dfsm.core.lock import locked
     from dfsm.loops.sweep import gain_grid
     from dfsm.loops.sweep import sweep as run_sweep
     from dfsm.report.sweep_article import sweep_article
 
     asked = load_sweep(config)
     check_no_bundle(output)
-    check_together(output, [_FIGURES, _TABLE, _PAGE])
-    with working(quiet), hushed():
+    check_together(output, [_FIGURES, _TABLE, _PAGE, _JOURNAL])
+    with locked(output), working(quiet), hushed():
         found = loaded(asked, config.parent)
         sources = [config, *(run.source for run in found.runs)]
         kept = [output / _TABLE] if (output / _TABLE).exists() else []
         check_spared(kept, config.parent / asked.model, found.model, sources)
+        output.mkdir(parents=True, exist_ok=True)
         controllers = gain_grid(found.controller, asked.gains, found.discon)
         swept = run_sweep(
             found.model,
@@ -55,6 +59,7 @@ def sweep(
             conditions=asked.alike(found.runs),
             measurements=asked.measure,
             settings=asked.settings(fit_start(found.model)),
+            journal=output / _JOURNAL,
         )
     article = sweep_article(swept, asked.exponent)
     write_or_keep(lambda path: _save(swept, article, asked.exponent, path), output)

@@ -22,6 +22,11 @@ from dfsm.controllers.traced import traced
 from dfsm.controllers.wrapper import Wrapper
 from dfsm.errors import DfsmError, missing
 
+# Beyond, nothing moves.
+_MOST_DAMPING = 1e6
+# Distance from critical damping, times (ω h)², below which a series is more exact than roots.
+_NEAR = 1e-3
+
 
 class ActuatorState(NamedTuple):
     """The controller's state; position and velocity; what takes them over one interval."""
@@ -57,7 +62,7 @@ class Actuator(Wrapper):
     ------
     DfsmError
         What is wrapped is no controller; a command that it does not set; a corner or rate that is
-        not above 0, a negative damping; or limits the wrong way round.
+        not above 0, a damping that is negative or beyond all use; or limits the wrong way round.
     """
 
     corner: jax.Array | None = eqx.field(converter=numbers("corner", optional=True), default=None)
@@ -74,7 +79,8 @@ class Actuator(Wrapper):
         if traced(self):
             return
         require_numbers(self, "corner", "rad/s, more than 0, or None for none", above=0)
-        require_numbers(self, "damping", "at least 0", least=0)
+        most = f"at least 0, {_MOST_DAMPING:g} at most"
+        require_numbers(self, "damping", most, least=0, most=_MOST_DAMPING)
         require_numbers(self, "rate", "more than 0", above=0, infinite=True)
         require_limits(self.limits)
 
@@ -85,10 +91,7 @@ class Actuator(Wrapper):
         require_shapes(self, "rate limits", len(self._columns), "command that it is for")
         moves = jnp.zeros((2, 2))
         if self.corner is not None:
-            square, slope = self.corner**2, 2 * self.damping * self.corner
-            zero, one = jnp.zeros_like(square), jnp.ones_like(square)
-            rate = jnp.stack([jnp.stack([zero, one]), jnp.stack([-square, -slope])])
-            moves = jax.scipy.linalg.expm(rate * self.interval)
+            moves = _moves(self.corner, self.damping, self.interval)
         inner = self.inner.start(measurements, commands)
         return ActuatorState(inner, position, jnp.zeros_like(position), moves)
 
@@ -118,3 +121,27 @@ class Actuator(Wrapper):
     def _columns(self) -> Any:
         chosen = self.inner.commands if self.acts_on is None else self.acts_on
         return np.array([self.inner.commands.index(n) for n in chosen], dtype=int)
+
+
+def _moves(corner: jax.Array, damping: jax.Array, interval: float) -> jax.Array:
+    """What takes position, away from where it goes, and velocity over an interval, ``(2, 2)``.
+
+    By its roots, however far the corner lies above what the interval resolves: a matrix exponential
+    is no number there.
+    """
+    x, off = corner * interval, damping**2 - 1
+    # e^{-ζx} cosh(√off x) and e^{-ζx} sinh(√off x) / √off, each where it can be computed.
+    near = jnp.abs(off) * x**2 < _NEAR
+    slow = jnp.sqrt(jnp.where((off < 0) & ~near, -off, 1.0))
+    fast = jnp.sqrt(jnp.where((off > 0) & ~near, off, 1.0))
+    decay = jnp.exp(-damping * x)
+    ends = jnp.exp(-x / (damping + fast)), jnp.exp(-x * (damping + fast))
+    y = jnp.where(near, off * x**2, 0.0)
+    close = jnp.where(near, x, 0.0)
+    even = decay * (1 + y / 2 * (1 + y / 12 * (1 + y / 30)))
+    odd = decay * close * (1 + y / 6 * (1 + y / 20 * (1 + y / 42)))
+    even = jnp.where(near, even, jnp.where(off < 0, decay * jnp.cos(slow * x), sum(ends) / 2))
+    apart = (ends[0] - ends[1]) / (2 * fast)
+    odd = jnp.where(near, odd, jnp.where(off < 0, decay * jnp.sin(slow * x) / slow, apart))
+    rows = [[even + damping * odd, odd / corner], [-corner * odd, even - damping * odd]]
+    return jnp.stack([jnp.stack(row) for row in rows])

@@ -122,8 +122,9 @@ def require_controller(found: Any, name: str = "") -> None:
             f"has {', '.join(_PARTS[:-1])} and {_PARTS[-1]}"
         )
     for part in ("start", "step"):
-        method = getattr(found, part)
-        require(callable(method), f"{of}{part}", shown(method), "a method")
+        # Not shown where it is one: it would tell of the whole controller.
+        if not callable(method := getattr(found, part)):
+            require(False, f"{of}{part}", shown(method), "a method")
     for names, units in (("measurements", "measurement_units"), ("commands", "command_units")):
         told, theirs = getattr(found, names), getattr(found, units)
         require_texts(f"{of}{names}", told)

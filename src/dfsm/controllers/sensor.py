@@ -16,6 +16,9 @@ from dfsm.controllers.wrapper import Wrapper
 from dfsm.core.settings import require_number
 from dfsm.errors import DfsmError, missing
 
+# Calls that a delay may last: as many measurements are kept.
+_MOST_CALLS = 100_000
+
 
 class SensorState(NamedTuple):
     """The controller's state; filtered signals, now and before; number of steps."""
@@ -50,7 +53,8 @@ class Sensor(Wrapper):
     ------
     DfsmError
         What is wrapped is no controller; a measurement that it does not read; a corner that is not
-        above 0, a negative delay or noise; or a seed that is no whole number.
+        above 0, a negative delay or noise, a delay longer than any run; or a seed that is no whole
+        number.
     """
 
     corner: jax.Array | None = eqx.field(converter=numbers("corner", optional=True), default=None)
@@ -60,8 +64,11 @@ class Sensor(Wrapper):
     acts_on: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        require_number("delay", self.delay, "seconds, at least 0", least=0)
-        require_number("seed", self.seed, "a whole number", whole=True)
+        longest = np.inf if traced(self.inner.interval) else _MOST_CALLS * self.inner.interval
+        expected = f"seconds, at least 0 and at most {_MOST_CALLS:,} of its intervals, {longest:g}"
+        require_number("delay", self.delay, expected, least=0, most=longest)
+        seeds = "a whole number of at most 63 bits"
+        require_number("seed", self.seed, seeds, whole=True, least=-(2**63), most=2**63 - 1)
         if self.acts_on is not None:
             require_texts("acts_on", self.acts_on)
         if lost := [n for n in self.acts_on or () if n not in self.inner.measurements]:

@@ -23,3 +23,9 @@ def as_arrays(controller: Any) -> Any:
     return jax.tree.map(
         lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, controller
     )
+
+
+def is_compiled(controller: Any) -> bool:
+    """Whether JAX can follow a controller: an equinox module, and what it wraps likewise."""
+    inner = getattr(controller, "inner", None)
+    return isinstance(controller, eqx.Module) and (inner is None or is_compiled(inner))

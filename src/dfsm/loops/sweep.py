@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from itertools import product
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,9 +37,10 @@ from dfsm.loops.load_cases import (
     require_shares,
     require_weights,
 )
+from dfsm.loops.sweep_journal import SweptLoop
+from dfsm.loops.sweep_loops import SweepLoops
 from dfsm.models.completion import completed
 from dfsm.models.dfsm import DFSM
-from dfsm.simulation.closed_loop import ClosedLoopRun, LoopStatus, reduced_loops
 from dfsm.simulation.loop_cases import ClosedLoopSettings, checked_loops
 
 if TYPE_CHECKING:
@@ -208,6 +209,7 @@ def sweep(
     conditions: Sequence[Hashable] | None = None,
     measurements: Mapping[str, str] | None = None,
     settings: SweepSettings | None = None,
+    journal: str | PathLike[str] | None = None,
 ) -> Sweep:
     """Close the loop with every controller over every run.
 
@@ -227,6 +229,11 @@ def sweep(
         own, and the more there are, the further the luckiest fit carries the extremes.
     settings
         Time window, and which signals are power and speed.
+    journal
+        File that keeps what each loop gave as soon as it is closed. A later sweep with it closes
+        only the loops that it lacks: a sweep that was ended goes on, and one with other runs or
+        controllers takes over those that are the same. What belongs to another model, controller,
+        run, time window or block is closed again. None keeps nothing.
 
     Returns
     -------
@@ -237,8 +244,8 @@ def sweep(
     DfsmError
         As `closed_loop`; or weights that are not one positive number per run, or not shares of the
         time where energy or extremes are asked for, conditions that are not one per run, no
-        controllers, one without a name or with the record's, or a power or speed that the model
-        does not have.
+        controllers, one without a name or with the record's, a power or speed that the model does
+        not have, or a journal that is something else.
     """
     require_kind("settings", settings, SweepSettings | None, "dfsm.SweepSettings(…)")
     settings = settings or SweepSettings()
@@ -256,21 +263,14 @@ def sweep(
         require_shares(weights)
     cases = LoadCases.of(weights, conditions)
     s = model.signals
-    units = {c.name: c.unit for c in (*s.states, *s.controls, *s.outputs)}
+    units = {c.name: c.unit for c in (*s.observed, *s.controls, *s.outputs)}
     named = [n for n in (settings.power, settings.speed, *settings.extremes) if n is not None]
     if lost := [n for n in named if n not in units]:
         raise DfsmError(f"settings: the model has {missing(lost, units)}")
     runs = [completed(run, s) for run in runs]
+    asked = SweepLoops(model, runs, list(controllers.values()), measurements, settings)
     with hushed():
-        rolled = reduced_loops(
-            model,
-            runs,
-            list(controllers.values()),
-            partial(_Loop.of, settings),
-            window=(settings.start, settings.stop),
-            measurements=measurements,
-            settings=settings.loop,
-        )
+        rolled = asked.closed(journal)
     loops = dict(zip(controllers, rolled, strict=True))
     swept = tuple(_swept(n, loops[n], cases, settings, units) for n in controllers)
     recorded = _recorded(runs, rolled, cases, settings, units)
@@ -325,42 +325,9 @@ def _told_apart(name: str, values: Any) -> dict[str, float]:
     return short if len(short) == len(numbers) else {f"{value!r}": value for value in numbers}
 
 
-@dataclass(frozen=True)
-class _Loop:
-    """What a sweep keeps of one closed loop.
-
-    Attributes
-    ----------
-    span
-        First and last time in s.
-    ending
-        One sentence, if it ended early.
-    figures
-        By channel; None if it ended early.
-    maxima
-        Of blocks, by channel, of those that are extrapolated.
-    """
-
-    span: tuple[float, float]
-    ending: str | None
-    figures: Mapping[str, Figures] | None
-    maxima: Mapping[str, Array]
-
-    @classmethod
-    def of(cls, settings: SweepSettings, loop: ClosedLoopRun) -> _Loop:
-        """All that is asked of it."""
-        run = loop.trajectory
-        span = (float(run.time[0]), float(run.time[-1]))
-        if loop.status is not LoopStatus.COMPLETED:
-            return cls(span, f"{run.name}: {loop.message}", None, {})
-        return cls(
-            span, None, case_figures(run), channel_maxima(run, settings.extremes, settings.block)
-        )
-
-
 def _swept(
     name: str,
-    loops: Sequence[_Loop],
+    loops: Sequence[SweptLoop],
     cases: LoadCases,
     settings: SweepSettings,
     units: Mapping[str, str],
@@ -382,7 +349,7 @@ def _extremes(
 
 def _recorded(
     runs: Sequence[Trajectory],
-    rolled: Sequence[Sequence[_Loop]],
+    rolled: Sequence[Sequence[SweptLoop]],
     cases: LoadCases,
     settings: SweepSettings,
     units: Mapping[str, str],

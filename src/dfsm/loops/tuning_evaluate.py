@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import json
 import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dfsm.controllers.gains import with_numbers
-from dfsm.controllers.traced import as_arrays
+from dfsm.controllers.traced import as_arrays, is_compiled
 from dfsm.controllers.tunable import Tunable
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
+from dfsm.loops.fingerprint import recorded_code
 from dfsm.loops.measures import Measure
 from dfsm.models.dfsm import DFSM
 from dfsm.models.staged import staged
 from dfsm.simulation.closed_loop import (
     ClosedLoopRun,
     LoopStatus,
-    is_compiled,
     result_of,
 )
 from dfsm.simulation.loop import Drive, outside_along, roll, roll_compiled
@@ -137,10 +135,14 @@ class Evaluator:
     def keep(self, journal: Path) -> None:
         """Take over what a journal holds, one evaluation a line, and add to it from now on."""
         if journal.exists():
-            lines = journal.read_text(encoding="utf-8").splitlines()[1:]
-            for line in lines:
+            text = journal.read_text(encoding="utf-8", errors="replace")
+            for line in text.splitlines()[1:]:
                 if (found := _from_line(line)) is not None:
                     self._know(found)
+            if text and not text.endswith("\n"):
+                # The line in whose middle a process was ended; the next begins one of its own.
+                with journal.open("a", encoding="utf-8") as stream:
+                    stream.write("\n")
         self._journal = journal
 
     def __call__(self, theta: Array, slopes: bool = False) -> Figured:
@@ -183,16 +185,8 @@ class Evaluator:
         self._known[key] = found
 
     def computed(self) -> tuple[Any, ...]:
-        """What is computed in a loop, step by step as JAX records it, and constants therein.
-
-        Numbers say too little of a controller: its delays and filters may be written into its code,
-        and a code that was edited is another controller of the same name.
-        """
-        recorded, *_ = eqx.filter_make_jaxpr(roll)(
-            self.model, self.wires, self._controller, self._drives[0]
-        )
-        # Where a function stood in memory says nothing of it.
-        return re.sub(r"0x[0-9a-f]+", "", str(recorded)), *_constants(recorded)
+        """What is computed in a loop, see `recorded_code`."""
+        return recorded_code(roll, self.model, self.wires, self._controller, self._drives[0])
 
     def held(self, channel: str) -> float:
         """Seconds for which the controller holds a command; 0 for what it does not set."""
@@ -253,20 +247,6 @@ class Evaluator:
                 column = shown.index(measure.channel)
                 slopes[m] = [along @ way[:, column] for way in ways]
         return figures, slopes
-
-
-def _constants(recorded: Any) -> Iterator[Any]:
-    """Arrays that code brought along, of functions within functions too; its text has scalars."""
-    yield from getattr(recorded, "consts", ())
-    for step in getattr(recorded, "jaxpr", recorded).eqns:
-        yield from (v.val for v in step.invars if np.ndim(getattr(v, "val", 0.0)))
-        for part in jax.tree.leaves(step.params, is_leaf=_is_recorded):
-            if _is_recorded(part):
-                yield from _constants(part)
-
-
-def _is_recorded(part: Any) -> bool:
-    return hasattr(part, "eqns") or hasattr(part, "consts")
 
 
 def _line(found: Figured) -> str:

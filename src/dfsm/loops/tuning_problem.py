@@ -22,6 +22,9 @@ from dfsm.loops.measures import Measure
 from dfsm.models.dfsm import DFSM
 from dfsm.simulation.loop_cases import ClosedLoopSettings
 
+# Starts, and points of a front: each is an optimization.
+_MOST_STARTS = 10_000
+
 
 @settings_class
 class Goal(Measure):
@@ -189,15 +192,18 @@ class TuneSettings:
         for name in ("start", "stop"):
             require_number(name, getattr(self, name), "seconds, or None", optional=True)
         require_kind("loop", self.loop, ClosedLoopSettings, "dfsm.ClosedLoopSettings(…)")
-        require_number("starts", self.starts, "a whole number, at least 1", least=1, whole=True)
+        expected = f"a whole number from 1 to {_MOST_STARTS:,}"
+        most = _MOST_STARTS
+        require_number("starts", self.starts, expected, least=1, most=most, whole=True)
         require_number("seed", self.seed, "a whole number, 0 or more", least=0, whole=True)
         require_number(
             "iterations", self.iterations, "a whole number, at least 1", least=1, whole=True
         )
         require_number("tolerance", self.tolerance, "between 0 and 1", above=0)
         require(self.tolerance < 1, "tolerance", self.tolerance, "between 0 and 1")
-        require_number("pareto", self.pareto, "0, or a whole number from 2 on", least=0, whole=True)
-        require(self.pareto != 1, "pareto", self.pareto, "0, or a whole number from 2 on")
+        expected = f"0, or a whole number from 2 on, {_MOST_STARTS:,} at most"
+        require_number("pareto", self.pareto, expected, least=0, most=most, whole=True)
+        require(self.pareto != 1, "pareto", self.pareto, expected)
 
 
 def check_problem(problem: TuningProblem, model: DFSM, runs: int, settings: TuneSettings) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,10 +12,15 @@ import numpy as np
 
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.host import from_host
+from dfsm.core.types import Array
 from dfsm.numerics.hats import hats
 
 # Numbers that a processor takes at once.
 _REGISTER = 4
+# Coefficients that are multiplied one by one at most.
+_FEW = 64
+# An interval of a grid, and where in it, 0 to 1.
+_At = tuple[jax.Array, jax.Array]
 
 
 class LinearModel(eqx.Module):
@@ -94,54 +100,138 @@ class SplitLinear(eqx.Module):
     grid
         As of `LinearModel`.
     first, then
-        Coefficients of some inputs and a 1, and of the others, in one row, schedule point by
-        schedule point and input by input, ``(point input target,)``: what is read lies together.
-        Zeros fill the targets of an input up to a whole number of a processor's registers.
-    targets, filled
-        Their number, without and with what fills them.
+        What some inputs and a 1 contribute, and what the others do.
+    targets
+        Their number.
     """
 
     grid: jax.Array
-    first: jax.Array
-    then: jax.Array
+    first: Share
+    then: Share
     targets: int = eqx.field(static=True)
-    filled: int = eqx.field(static=True)
 
     @classmethod
     def of(cls, linear: LinearModel, first: Sequence[int], then: Sequence[int]) -> SplitLinear:
         """The map of inputs in this order, which is another than that of the model's."""
-        targets = linear.offsets.shape[1]
-        filled = -(-targets // _REGISTER) * _REGISTER
-        more = ((0, 0), (0, 0), (0, filled - targets))
-        L = np.pad(np.swapaxes(np.asarray(linear.coefficients), 1, 2), more)
-        b = np.pad(np.asarray(linear.offsets)[:, None], more)
-        parts = np.concatenate([L[:, list(first)], b], axis=1), L[:, list(then)]
-        known, rest = (from_host(part.ravel()) for part in parts)
-        return cls(linear.grid, known, rest, targets, filled)
+        L, b = np.asarray(linear.coefficients), np.asarray(linear.offsets)
+        known = np.concatenate([L[:, :, list(first)], b[:, :, None]], axis=2)
+        return cls(linear.grid, Share.of(known), Share.of(L[:, :, list(then)]), b.shape[1])
 
     def __call__(self, first: jax.Array, then: jax.Array, value: jax.Array) -> jax.Array:
         """Evaluate at two vectors of inputs, ``(input,)``, and a schedule value: ``(target,)``."""
-        known = jnp.concatenate([first, jnp.ones(1)])
-        if self.grid.shape[0] == 1:
-            parts = known @ self._rows(self.first), then @ self._rows(self.then)
-        else:
-            at = _place(self.grid, value)
-            parts = self._between(known, self.first, at), self._between(then, self.then, at)
-        return (parts[0] + parts[1])[: self.targets]
-
-    def _between(
-        self, inputs: jax.Array, table: jax.Array, at: tuple[jax.Array, jax.Array]
-    ) -> jax.Array:
-        """Inputs with the weights of two points times the coefficients there, as one product."""
-        (i, t), size = at, len(inputs) * self.filled
-        both = jax.lax.dynamic_slice(table, (i * size,), (2 * size,), allow_negative_indices=False)
-        return jnp.concatenate([(1 - t) * inputs, t * inputs]) @ self._rows(both)
-
-    def _rows(self, table: jax.Array) -> jax.Array:
-        return table.reshape(-1, self.filled)
+        at = None if self.grid.shape[0] == 1 else _place(self.grid, value)
+        total = self.first(jnp.concatenate([first, jnp.ones(1)]), at)
+        return jnp.stack([jnp.asarray(sum_, dtype=float) for sum_ in self.then(then, at, total)])
 
 
-def _place(grid: jax.Array, value: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+class Share(eqx.Module):
+    """What some inputs contribute to all targets.
+
+    Most coefficients of a model are zero or the same along its schedule. What is zero is left out,
+    what is the same is not interpolated, and few are multiplied one by one: a product of small
+    matrices costs as much as a hundred of them.
+
+    Attributes
+    ----------
+    same, along
+        Those that are the same along the schedule, and those that are not.
+    """
+
+    same: Coefficients
+    along: Coefficients
+
+    @classmethod
+    def of(cls, coefficients: Array) -> Share:
+        """Of coefficients by schedule point, ``(point, target, input)``."""
+        moves = np.ptp(coefficients, axis=0) != 0
+        same = np.where(moves, 0.0, coefficients[:1])
+        return cls(Coefficients.of(same), Coefficients.of(np.where(moves, coefficients, 0.0)))
+
+    def __call__(
+        self, inputs: jax.Array, at: _At | None, total: Sequence[Any] | None = None
+    ) -> list[Any]:
+        """Their sums by target, to which those of `total` are added."""
+        return self.along(inputs, at, self.same(inputs, None, total))
+
+
+class Coefficients(eqx.Module):
+    """Coefficients that are not zero, as loops take them.
+
+    Attributes
+    ----------
+    values
+        One by one, ``(point entry,)``; or where they are many as a matrix of the inputs that have
+        any, schedule point by schedule point and input by input, ``(point input target,)``: what
+        is read lies together. Zeros fill the targets of an input up to a whole number of a
+        processor's registers.
+    entries
+        Pairs of target and input; None for a matrix.
+    inputs
+        Of the matrix.
+    targets, filled
+        Their number, without and with what fills them.
+    """
+
+    values: jax.Array
+    entries: tuple[tuple[int, int], ...] | None = eqx.field(static=True)
+    inputs: tuple[int, ...] = eqx.field(static=True)
+    targets: int = eqx.field(static=True)
+    filled: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, coefficients: Array) -> Coefficients:
+        """Of those by schedule point, ``(point, target, input)``."""
+        targets = coefficients.shape[1]
+        filled = -(-targets // _REGISTER) * _REGISTER
+        found = (coefficients != 0).any(axis=0)
+        inputs = tuple(np.flatnonzero(found.any(axis=0)).tolist())
+        if found.sum() <= _FEW:
+            rows, columns = np.nonzero(found)
+            entries = tuple(zip(rows.tolist(), columns.tolist(), strict=True))
+            values = coefficients[:, rows, columns]
+            return cls(from_host(values.ravel()), entries, inputs, targets, filled)
+        matrix = np.swapaxes(coefficients[:, :, list(inputs)], 1, 2)
+        matrix = np.pad(matrix, ((0, 0), (0, 0), (0, filled - targets)))
+        return cls(from_host(matrix.ravel()), None, inputs, targets, filled)
+
+    def __call__(
+        self, inputs: jax.Array, at: _At | None, total: Sequence[Any] | None = None
+    ) -> list[Any]:
+        """Sums of products by target, to which those of `total` are added."""
+        sums: list[Any] = [0.0] * self.targets if total is None else list(total)
+        if not self.inputs:
+            return sums
+        if self.entries is None:
+            taken = _columns(inputs, self.inputs)
+            values = self.values if at is None else self._two(at)
+            if at is not None:
+                taken = jnp.concatenate([(1 - at[1]) * taken, at[1] * taken])
+            product = taken @ values.reshape(-1, self.filled)
+            return [sum_ + product[k] for k, sum_ in enumerate(sums)]
+        values, count = self.values, len(self.entries)
+        if at is not None:
+            two = self._two(at)
+            values = (1 - at[1]) * two[:count] + at[1] * two[count:]
+        for k, (target, column) in enumerate(self.entries):
+            sums[target] = sums[target] + values[k] * inputs[column]
+        return sums
+
+    def _two(self, at: _At) -> jax.Array:
+        """Values of two schedule points."""
+        size = len(self.inputs) * self.filled if self.entries is None else len(self.entries)
+        return jax.lax.dynamic_slice(
+            self.values, (at[0] * size,), (2 * size,), allow_negative_indices=False
+        )
+
+
+def _columns(inputs: jax.Array, columns: tuple[int, ...]) -> jax.Array:
+    """Some of the inputs, in parts that lie together."""
+    cuts = np.flatnonzero(np.diff(columns) > 1) + 1
+    spans = np.split(np.array(columns), cuts)
+    return jnp.concatenate([inputs[span[0] : span[-1] + 1] for span in spans])
+
+
+def _place(grid: jax.Array, value: jax.Array | float) -> _At:
     """Interval of the grid that a schedule value lies in, and where in it, 0 to 1."""
     value = jnp.clip(value, grid[0], grid[-1])
     i = jnp.clip(jnp.sum(value >= grid) - 1, 0, grid.shape[0] - 2)

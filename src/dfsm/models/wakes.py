@@ -38,6 +38,7 @@ def wake_columns(model: DFSM) -> list[int]:
     return [column for rotor in _lagging(model) for column in rotor.wake_columns]
 
 
+@eqx.filter_jit
 def settled_wakes(model: DFSM, inputs: jax.Array) -> jax.Array:
     """Input vectors ``(..., input)`` with the induced velocities that they lead to."""
     for rotor in _lagging(model):

@@ -48,8 +48,15 @@ def block_maxima(time: Series, values: Series, block: float) -> Array:
     Raises
     ------
     DfsmError
-        There are fewer than five whole blocks.
+        There are fewer than five whole blocks, or blocks without samples.
     """
+    # An interval of the mesh that is longer than a block leaves one without samples.
+    longest = float(np.diff(time).max())
+    if block < longest * (1 - 1e-9):
+        raise DfsmError(
+            f"blocks of {block:g} s hold no sample where samples are {longest:g} s apart: take "
+            "longer blocks"
+        )
     count = int((time[-1] - time[0]) / block * (1 + 1e-9))
     if count < _FEWEST:
         raise DfsmError(
@@ -94,8 +101,10 @@ def extrapolated(
     wide = np.maximum(scale, 1e-12 * np.maximum(np.abs(location), 1.0))
 
     def rare(x: float) -> float:
-        # 1 - exp(-e), accurate where it is tiny.
-        return float(w @ -np.expm1(-np.exp(-(x - location) / wide))) - 1 / blocks
+        # 1 - exp(-e), accurate where it is tiny; far below a narrow one nothing is rare.
+        with np.errstate(over="ignore"):
+            above = -np.expm1(-np.exp(-(x - location) / wide))
+        return float(w @ above) - 1 / blocks
 
     low = float((location - 20 * wide).min())
     high = float((location + (np.log(blocks) + 50) * wide).max())
@@ -103,7 +112,8 @@ def extrapolated(
         return float(location.max()), 0.0
     x = float(brentq(rare, low, high, xtol=1e-12 * max(abs(low), abs(high), 1e-300)))  # pyright: ignore[reportArgumentType]
     y = (x - location) / wide
-    density = w * np.exp(-y - np.exp(-y)) / wide
+    with np.errstate(over="ignore"):
+        density = w * np.exp(-y - np.exp(-y)) / wide
     # dx = Σ density (d location + y d scale) / Σ density.
     share = density / density.sum()
     a, b, c = _VARIANCE

@@ -15,14 +15,15 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, TypeVar, overload
+from itertools import product
+from typing import TypeVar, overload
 
-import equinox as eqx
 import numpy as np
 
 from dfsm.controllers.controller import Controller
-from dfsm.controllers.traced import as_arrays
+from dfsm.controllers.traced import as_arrays, is_compiled
 from dfsm.core.host import from_host
+from dfsm.core.progress import track
 from dfsm.core.types import Array
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.errors import DfsmWarning, printable
@@ -46,6 +47,8 @@ from dfsm.simulation.wires import Wires, connect, not_commanded
 
 # What is kept of a closed loop.
 Reduced = TypeVar("Reduced")
+# Places of a loop's run and controller.
+Task = tuple[int, int]
 
 
 class LoopStatus(enum.Enum):
@@ -232,7 +235,7 @@ def closed_loops(
     """
     begin = clock.perf_counter()
     batch = _Batch(model, runs, controllers, measurements, window, settings)
-    results = batch.each(lambda run: run, watched=True)
+    results = batch.each(lambda run, _: run, watched=True)
     wall = (clock.perf_counter() - begin) / max(1, sum(map(len, results)))
     return [[replace(run, wall_time=wall) for run in of_one] for of_one in results]
 
@@ -241,11 +244,12 @@ def reduced_loops(
     model: DFSM,
     runs: Sequence[Trajectory],
     controllers: Sequence[Controller],
-    reduce: Callable[[ClosedLoopRun], Reduced],
+    reduce: Callable[[ClosedLoopRun, Task], Reduced],
     *,
     window: tuple[float | None, float | None] = (None, None),
     measurements: Mapping[str, str] | None = None,
     settings: ClosedLoopSettings | None = None,
+    known: Mapping[Task, Reduced] | None = None,
 ) -> list[list[Reduced]]:
     """As `closed_loops`, of which only what `reduce` makes of each loop is kept.
 
@@ -254,10 +258,13 @@ def reduced_loops(
     model, runs, controllers, window, measurements, settings
         As for `closed_loops`.
     reduce
-        Called in threads as soon as a loop is closed. How long it is outside the training range
-        is not a number.
+        Called in threads as soon as a loop is closed, with its run's and its controller's place.
+        How long it is outside the training range is not a number.
+    known
+        What is known already, by both places: these loops are not closed.
     """
-    return _Batch(model, runs, controllers, measurements, window, settings).each(reduce)
+    batch = _Batch(model, runs, controllers, measurements, window, settings)
+    return batch.each(reduce, known=known)
 
 
 @dataclass(frozen=True)
@@ -272,7 +279,10 @@ class _Batch:
     settings: ClosedLoopSettings | None
 
     def each(
-        self, reduce: Callable[[ClosedLoopRun], Reduced], watched: bool = False
+        self,
+        reduce: Callable[[ClosedLoopRun, Task], Reduced],
+        watched: bool = False,
+        known: Mapping[Task, Reduced] | None = None,
     ) -> list[list[Reduced]]:
         """What `reduce` makes of every loop, per controller in the order of the runs."""
         model, controllers = self.model, self.controllers
@@ -291,18 +301,20 @@ class _Batch:
             case = cases[interval][run]
             return padded(case, enough_calls(case))
 
-        def closed(task: tuple[int, int]) -> Reduced:
+        def closed(task: Task) -> Reduced:
             run, i = task
             case = cases[intervals[i]][run]
             path = rollers[i](case, partial(drive, intervals[i], run))
-            return reduce(result_of(model, wires[i], controllers[i], case, path))
+            return reduce(result_of(model, wires[i], controllers[i], case, path), task)
 
         # All controllers of a run after one another, so that its drive is made once and not kept.
         # XLA keeps a loop on one core, and one that holds several controllers side by side costs
         # more than these in turn; libraries wait in processes of their own.
-        tasks = [(run, i) for run in range(count) for i in range(len(controllers))]
+        found = dict(known or {})
+        tasks = [t for t in product(range(count), range(len(controllers))) if t not in found]
         with ThreadPoolExecutor(cores) as pool:
-            found = dict(zip(tasks, pool.map(closed, tasks), strict=True))
+            done = track(pool.map(closed, tasks), "closed loops", len(tasks))
+            found |= dict(zip(tasks, done, strict=True))
         return [[found[run, i] for run in range(count)] for i in range(len(controllers))]
 
 
@@ -329,12 +341,6 @@ def _roller(
         return path._replace(outside=outside_along(model, drive, path)) if watched else path
 
     return compiled
-
-
-def is_compiled(controller: Any) -> bool:
-    """Whether JAX can follow a controller: an equinox module, and what it wraps likewise."""
-    inner = getattr(controller, "inner", None)
-    return isinstance(controller, eqx.Module) and (inner is None or is_compiled(inner))
 
 
 # -- judging the outcome ------------------------------------------------------------------------

@@ -25,6 +25,8 @@ from dfsm.simulation.simulate import initial_azimuth, initial_state
 
 # Ratios of intervals with denominators up to this are met exactly.
 _MOST_PARTS = 20
+# Steps of one loop: an hour at intervals of 1.2 ms.
+_MOST_STEPS = 3_000_000
 # Calls are padded to a multiple of this.
 _PAD = 400
 
@@ -155,8 +157,8 @@ def prepared_cases(
     Raises
     ------
     DfsmError
-        A channel that is missing or not finite, a window that holds nothing of a run, or a run not
-        longer than the start-up.
+        A channel that is missing or not finite, a window that holds nothing of a run, a run not
+        longer than the start-up, or more steps than can be waited for.
     """
     for name, end in zip(("start", "stop"), window, strict=True):
         require_number(name, end, "seconds, or None for that end of the run", optional=True)
@@ -194,6 +196,7 @@ def _case(
         first = start - settings.start_up
     part = run.window(first, stop)
     begins, ends = float(part.time[0]), float(part.time[-1])
+    _require_few_steps(run, ends - begins, interval, settings.step)
     calls = int(np.floor((ends - begins) / interval * (1 + 1e-9)))
     scored = begins + settings.start_up
     after = np.flatnonzero(part.time >= scored - 1e-9 * part.duration)
@@ -221,6 +224,23 @@ def _case(
     inside = part.time <= mesh[-1] + 1e-6 * h
     part = replace(part, time=part.time[inside], values=part.values[inside])
     return LoopCase(part, drive, per_call, int(after[0]), run)
+
+
+def _require_few_steps(
+    run: Trajectory, duration: float, interval: float, step: float | None
+) -> None:
+    """Refuse so short an interval or step that inputs along all of it would fill the memory."""
+    plant = step is not None and step < interval
+    shortest = step if step is not None and plant else interval
+    with np.errstate(over="ignore"):
+        steps = float(np.float64(duration) / shortest)
+    if steps > _MOST_STEPS:
+        what = "a plant step" if plant else "a controller's interval"
+        raise DfsmError(
+            f"{run.where}: {what} of {shortest:g} s makes {steps:.3g} steps over {duration:g} s, "
+            f"at most {_MOST_STEPS:,} are allowed: choose one of at least "
+            f"{1.01 * duration / _MOST_STEPS:.3g} s, or a shorter time window"
+        )
 
 
 def _steps_per_call(interval: float, sampling: float, step: float | None) -> int:

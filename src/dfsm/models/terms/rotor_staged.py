@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,10 +23,13 @@ class StagedRotor(RotorTerm):
     Attributes
     ----------
     rows
-        Weights of the splines with both forces side by side, ``(cell + 3, pitch cell + 3, 2)``.
+        Weights of the splines with both forces side by side, flat.
+    shape
+        Theirs, ``(cell + 3, pitch cell + 3, 2)``.
     """
 
     rows: jax.Array
+    shape: tuple[int, int, int] = eqx.field(static=True)
 
     def of_numbers(self, signals: Sequence[jax.Array]) -> jax.Array:
         """Thrust and torque; what disturbances do to the wind comes before what moves in it."""
@@ -53,10 +57,11 @@ class StagedRotor(RotorTerm):
 
     def surface(self, wind: jax.Array, tips: jax.Array, pitch: jax.Array) -> jax.Array:
         """As `RotorTerm.surface`."""
-        return surface_of_rows(self.rows, self.grid, wind, tips, pitch)
+        return surface_of_rows(self.rows, self.shape, self.grid, (wind, tips, pitch))
 
 
 def staged_rotor(term: RotorTerm) -> StagedRotor:
     """The term as loops take it."""
-    rows = from_host(np.moveaxis(np.asarray(term.weights), 0, 2))
-    return StagedRotor(**{f.name: getattr(term, f.name) for f in fields(RotorTerm)}, rows=rows)
+    rows = np.moveaxis(np.asarray(term.weights), 0, 2)
+    parts = {f.name: getattr(term, f.name) for f in fields(RotorTerm)}
+    return StagedRotor(**parts, rows=from_host(rows.ravel()), shape=rows.shape)

@@ -100,16 +100,21 @@ def surface(
 
 
 def surface_of_rows(
-    rows: jax.Array, grid: Grid, wind: jax.Array, tip_speed: jax.Array, pitch: jax.Array
+    flat: jax.Array,
+    shape: tuple[int, int, int],
+    grid: Grid,
+    inflow: tuple[jax.Array, jax.Array, jax.Array],
 ) -> jax.Array:
     """`surface_values` of weights with both forces side by side, ``(cell + 3, pitch cell + 3, 2)``.
 
-    All that is read of a row lies together, which a processor takes at once.
+    All that is read of a row lies together, which a processor takes at once. The weights come as a
+    flat array and their shape: XLA takes what is read of a part that was reshaped for all of it,
+    and compiles no loop in one piece that seems to read so much.
     """
-    cells, pitches, count = rows.shape
+    (cells, pitches, count), (wind, tip_speed, pitch) = shape, inflow
     i, along = _basis(*_angle(cells - 3, grid, wind, tip_speed))
     j, across = _basis(*_pitch(pitches - 3, grid, pitch))
-    flat, parts = rows.reshape(-1), []
+    parts = []
     for k in range(4):
         first = ((i + k) * pitches + j) * count
         part = jax.lax.dynamic_slice(flat, (first,), (4 * count,), allow_negative_indices=False)
