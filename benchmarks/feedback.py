@@ -79,7 +79,7 @@ def _judged(
     effect = np.zeros(order)
     effect[-1] = row[0]
     told = much_unexplained(series) and is_feedback(law, A, effect)
-    if told and (course := own_course(series, 0)) is not None:
+    if told and (course := own_course(series, 0, A)) is not None:
         told = course.directions < 1 + order
     fine = residuals_of([time], inputs, slope, left, inputs_too=True)
     return float(row[0] / b - 1), bool(told or (fine is not None and pulled(fine, [0])))

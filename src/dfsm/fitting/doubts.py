@@ -346,7 +346,7 @@ def _feedback(
             laws[column] = follows(series, column, range(states.start, states.stop))
         if not is_feedback(laws[column], A, mean[:, column]):
             continue
-        course = own_course(series, column)
+        course = own_course(series, column, A)
         if course is None:
             told.append(column)
             continue

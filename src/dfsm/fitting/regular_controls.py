@@ -22,7 +22,9 @@ from dfsm.numerics.least_squares import correlation_length
 _PAST, _BACK = 20, 2.0
 # Share of a control's variance that they must tell, and of what the fit leaves that they may: in
 # simulated loops under unknown forces they tell 67 % of a control at most, of sums of sines 97 %.
-_OWN, _FORCE = 0.9, 0.8
+_OWN, _FORCE = 0.96, 0.8
+# Growth over the longest run, as an exponent, up to which a fit is not unstable.
+_GROWS = 1.0
 # Share of the largest direction in which the past varies below which there is none.
 _DIRECTION = 1e-3
 
@@ -40,8 +42,11 @@ class Course:
     directions: int
 
 
-def own_course(residuals: Residuals, control: int) -> Course | None:
+def own_course(residuals: Residuals, control: int, A: Array) -> Course | None:
     """What a control is made of, if its distant past tells it.
+
+    Where the unknown force is a sine above all, the control that answers it is one, too, and ahead
+    of the state by more than a control of an open loop can be: then the fit comes out unstable.
 
     Parameters
     ----------
@@ -49,12 +54,14 @@ def own_course(residuals: Residuals, control: int) -> Course | None:
         Of any row.
     control
         Column of the inputs.
+    A
+        Of the fit, ``(state, state)``.
 
     Returns
     -------
     Course or None
         None where it may be an answer to what the row does not hold: its past does not tell it, or
-        tells what the fit leaves over, too, as where the unknown force is a sine.
+        tells what the fit leaves over, too, or the fit is unstable where it has enough sines.
     """
     centred = residuals.centred()
     u = [run[:, control] for run in centred.inputs]
@@ -66,7 +73,11 @@ def own_course(residuals: Residuals, control: int) -> Course | None:
         return None
     past = stacked([_past(run, len(run) - _PAST + 1) for run in u])
     sizes = np.linalg.svd(past, compute_uv=False) ** 2
-    return Course(int(np.sum(sizes > _DIRECTION * sizes[0])))
+    course = Course(int(np.sum(sizes > _DIRECTION * sizes[0])))
+    # What too few sines tell of the states is chance, growth included.
+    longest = residuals.step * max(map(len, u))
+    grows = float(np.linalg.eigvals(A).real.max()) * longest > _GROWS
+    return None if grows and course.directions > len(A) else course
 
 
 def poor_note(row: str, name: str, course: Course, coefficients: int, unexplained: float) -> str:
