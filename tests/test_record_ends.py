@@ -46,7 +46,7 @@ def test_rows_that_were_not_recorded_are_left_out(tmp_path):
 
 
 def test_rows_filled_up_with_the_first_sample_are_left_out(tmp_path):
-    """As a logger does before its trigger: a motion that stands still, and goes on at full speed."""
+    """As loggers do before a trigger: a motion stands still, and goes on at full speed."""
     filled = LIVE.copy()
     filled[:120], filled[120:] = LIVE[7], LIVE[7 : 7 + 280]
     run = table(tmp_path / "a.csv", filled)
