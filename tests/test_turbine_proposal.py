@@ -23,8 +23,8 @@ TOWER = {"TTDspFA": "m", "YawBrTDxp": "m"}
 TIME = np.arange(0, 60, 0.1)
 
 
-def recorded(names: list[str]) -> Trajectory:
-    rng = np.random.default_rng(1)
+def recorded(names: list[str], seed: int = 1) -> Trajectory:
+    rng = np.random.default_rng(seed)
     waves = [np.sin(f * TIME + rng.uniform(0, 6)) for f in rng.uniform(0.1, 1.0, len(names))]
     channels = tuple(Channel(n, (UNITS | TOWER)[n]) for n in names)
     return Trajectory(TIME, 10 + np.stack(waves, axis=1), channels, name="run")
@@ -46,8 +46,10 @@ def test_waves_act_ahead_on_hulls_that_float(tmp_path, floats):
 
 @pytest.mark.parametrize("recorded_as", [["YawBrTDxp"], ["TTDspFA"], ["YawBrTDxp", "TTDspFA"]])
 def test_the_tower_top_swings_by_either_of_its_names(tmp_path, recorded_as):
-    write_table(recorded([*UNITS, *recorded_as]), tmp_path / "run.parquet")
-    write_config([str(tmp_path / "run.parquet")], tmp_path / "config.yaml")
+    files = [tmp_path / f"run{seed}.parquet" for seed in (1, 2)]
+    for seed, file in enumerate(files):
+        write_table(recorded([*UNITS, *recorded_as], seed), file)
+    write_config([str(file) for file in files], tmp_path / "config.yaml")
     settings = load_config(tmp_path / "config.yaml")[0].fit_settings()
     states = [(s.name, s.order) for s in settings.states]
     assert states == [("PtfmPitch", 2), (recorded_as[-1], 2), ("GenSpeed", 1)]
