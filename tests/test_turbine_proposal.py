@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,7 +50,8 @@ def test_waves_act_ahead_on_hulls_that_float(tmp_path, floats):
 def test_the_tower_top_swings_by_either_of_its_names(tmp_path, recorded_as):
     files = [tmp_path / f"run{seed}.parquet" for seed in (1, 2)]
     for seed, file in enumerate(files):
-        write_table(recorded([*UNITS, *recorded_as], seed), file)
+        run = recorded([*UNITS, *recorded_as], seed)
+        write_table(replace(run, time=10 * run.time), file)  # long enough to refine on
     write_config([str(file) for file in files], tmp_path / "config.yaml")
     settings = load_config(tmp_path / "config.yaml")[0].fit_settings()
     states = [(s.name, s.order) for s in settings.states]
