@@ -83,7 +83,16 @@ def test_a_sine_follows_from_its_state_and_is_no_feedback(seed):
     u = np.sin(0.17 * np.arange(2000.0))
     row, notes = told(one_state(u, 0.1 * slow(rng, 2000, 15)), ONE)
     assert row[0] == pytest.approx(0.2, rel=0.25)
-    assert not [n for n in notes if "feedback" in n or "believe" in n]
+    assert not [n for n in notes if "feedback" in n or "believe" in n or "late" in n]
+
+
+def test_a_sine_is_not_late():
+    """Any phase of it is what the state and the control make up together."""
+    time = np.arange(1200.0)
+    rough = slow(np.random.default_rng(705), 1200, 12)
+    row, notes = told(one_state(np.sin(0.25 * time), 0.12 * rough), ONE)
+    assert row[0] == pytest.approx(0.2, rel=0.25)
+    assert not [n for n in notes if "late" in n]
 
 
 @pytest.mark.parametrize("seed", [0, 2])

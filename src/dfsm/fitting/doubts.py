@@ -37,7 +37,7 @@ from dfsm.fitting.feedback import (
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
 from dfsm.fitting.noisy_inputs import noise_shares
 from dfsm.fitting.over_intervals import coarse_note
-from dfsm.fitting.regular_controls import own_course, poor_note
+from dfsm.fitting.regular_controls import course_of, own_course, poor_note
 from dfsm.fitting.residuals import Residuals, residuals_of
 from dfsm.fitting.rough_inputs import rough_note
 from dfsm.fitting.samples import Samples
@@ -243,17 +243,21 @@ def _late(
     """Delays that are not there as features yet, to a sample: what these leave is no new delay.
 
     Nor is one of about a sample in a control that is little else than the states: what these were
-    a sample ago is their derivative. Then its law is the other answer.
+    a sample ago is their derivative. Then its law is the other answer. Nor one of so few sines that
+    a delay is a coefficient too many: late, they are what other coefficients make of them.
     """
     given = [(f.source, f.seconds) for f in settings.features if f.kind == "delay" and f.seconds]
     near = max(series.sample, series.step)
     order = samples.signals.order
     states, controls = order.columns("states"), len(samples.signals.controls)
     columns, alike = list(range(len(names))), None
+    acting = states.stop - states.start
     while (late := late_inputs(series, columns)) is not None:
         again = set[int]()
         for column, seconds in late.seconds.items():
-            if any(names[column] == n and abs(seconds - s) <= near for n, s in given):
+            made = course_of(series, column)
+            there = any(names[column] == n and abs(seconds - s) <= near for n, s in given)
+            if there or (made is not None and made.directions < 2 + acting):
                 again.add(column)
             elif column < controls and seconds <= _A_SAMPLE * near:
                 law = follows(series, column, range(states.start, states.stop))

@@ -25,8 +25,9 @@ _PAST, _BACK = 20, 2.0
 _OWN, _FORCE = 0.96, 0.8
 # Growth over the longest run, as an exponent, up to which a fit is not unstable.
 _GROWS = 1.0
-# Share of the largest direction in which the past varies below which there is none.
-_DIRECTION = 1e-3
+# Share of the largest direction in which the past varies below which there is none: means over
+# intervals that are no whole number of samples are a little rough.
+_DIRECTION = 1e-2
 
 
 @dataclass(frozen=True)
@@ -64,20 +65,42 @@ def own_course(residuals: Residuals, control: int, A: Array) -> Course | None:
         tells what the fit leaves over, too, or the fit is unstable where it has enough sines.
     """
     centred = residuals.centred()
-    u = [run[:, control] for run in centred.inputs]
-    memory = max(_memory(u), _memory(centred.left))
-    back = min(int(np.ceil(_BACK * memory)), min(map(len, u)) // 3)
+    course = course_of(residuals, control)
+    if course is None or _foretold(centred.left, _far_back(centred, control)) > _FORCE:
+        return None
+    # What too few sines tell of the states is chance, growth included.
+    longest = residuals.step * max(map(len, centred.left))
+    grows = float(np.linalg.eigvals(A).real.max()) * longest > _GROWS
+    return None if grows and course.directions > len(A) else course
+
+
+def course_of(residuals: Residuals, column: int) -> Course | None:
+    """What an input is made of, if its distant past tells it.
+
+    Parameters
+    ----------
+    residuals
+        Of any row.
+    column
+        Of the inputs.
+    """
+    centred = residuals.centred()
+    u = [run[:, column] for run in centred.inputs]
+    back = _far_back(centred, column)
     if min(map(len, u)) < back + 4 * _PAST or sum(map(len, u)) < 10 * _PAST:
         return None
-    if _foretold(u, back) < _OWN or _foretold(centred.left, back) > _FORCE:
+    if _foretold(u, back) < _OWN:
         return None
     past = stacked([_past(run, len(run) - _PAST + 1) for run in u])
     sizes = np.linalg.svd(past, compute_uv=False) ** 2
-    course = Course(int(np.sum(sizes > _DIRECTION * sizes[0])))
-    # What too few sines tell of the states is chance, growth included.
-    longest = residuals.step * max(map(len, u))
-    grows = float(np.linalg.eigvals(A).real.max()) * longest > _GROWS
-    return None if grows and course.directions > len(A) else course
+    return Course(int(np.sum(sizes > _DIRECTION * sizes[0])))
+
+
+def _far_back(centred: Residuals, column: int) -> int:
+    """Intervals beyond which neither an input nor what the fit leaves remembers anything."""
+    u = [run[:, column] for run in centred.inputs]
+    memory = max(_memory(u), _memory(centred.left))
+    return min(int(np.ceil(_BACK * memory)), min(map(len, u)) // 3)
 
 
 def poor_note(row: str, name: str, course: Course, coefficients: int, unexplained: float) -> str:
