@@ -79,7 +79,7 @@ def test_held_inputs_are_recognised_fitted_and_simulated_exactly(tmp_path):
 
 def test_a_smooth_command_that_is_updated_at_regular_moments_is_held():
     time = np.arange(600.0)
-    command = np.sin(0.05 * time) + 0.6 * np.cos(0.113 * time)
+    command = np.sin(0.015 * time) + 0.6 * np.cos(0.034 * time)
     u = np.repeat(command[::4], 4)[:, None]
     a = np.array([[-0.05]])
     states = stepped(a, np.array([[0.1]]), 1.0, u)
