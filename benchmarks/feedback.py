@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 from dfsm.core.types import Array
 from dfsm.fitting.coloured import pulled
 from dfsm.fitting.feedback import follows, is_feedback, much_unexplained
+from dfsm.fitting.regular_controls import own_course
 from dfsm.fitting.residuals import residuals_of
 
 SEED, EACH = 5, 15
@@ -78,7 +79,10 @@ def _judged(
     effect = np.zeros(order)
     effect[-1] = row[0]
     told = much_unexplained(series) and is_feedback(law, A, effect)
-    return float(row[0] / b - 1), bool(told or pulled(series, [0]))
+    if told and (course := own_course(series, 0, A)) is not None:
+        told = course.directions < 1 + order
+    fine = residuals_of([time], inputs, slope, left, inputs_too=True)
+    return float(row[0] / b - 1), bool(told or (fine is not None and pulled(fine, [0])))
 
 
 def _record(

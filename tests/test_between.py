@@ -77,6 +77,23 @@ def test_held_inputs_are_recognised_fitted_and_simulated_exactly(tmp_path):
     np.testing.assert_allclose(record.states[:, 0], exact, atol=1e-3)
 
 
+def test_a_smooth_command_that_is_updated_at_regular_moments_is_held():
+    time = np.arange(600.0)
+    command = np.sin(0.015 * time) + 0.6 * np.cos(0.034 * time)
+    u = np.repeat(command[::4], 4)[:, None]
+    a = np.array([[-0.05]])
+    states = stepped(a, np.array([[0.1]]), 1.0, u)
+    result = fit([run_of(time, states, u)], LINEAR)
+    assert result.model.signals.between == ("hold",)
+    np.testing.assert_allclose(coefficients(result), [[0.1, -0.05]], atol=1e-5)
+    # As two rates are merged into one table, with the choice that the fit asks for.
+    gaps = np.where(time[:, None] % 4 == 0, u, np.nan)
+    merged = fit([run_of(time, states, gaps)], replace(LINEAR, slower="hold"))
+    assert merged.model.signals.between == ("hold",)
+    # A slow ramp that is rounded moves at regular moments, too, by one step of its rounding.
+    assert not is_held(np.round(0.25 * time))
+
+
 def test_a_state_of_order_2_under_a_held_and_a_smooth_input():
     fine, steps = 50, 400
     time = np.arange(steps) * 0.5

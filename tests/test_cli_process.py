@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from dfsm import fit as fit_function
 from dfsm.config.fit import load_config
 from dfsm.data.readers import read
 from dfsm.data.readers.tables import write_table
-from dfsm.errors import DfsmWarning
+from dfsm.errors import DfsmError, DfsmWarning
 
 SCRIPT = Path(sys.executable).with_name("dfsm")
 
@@ -54,6 +55,21 @@ def test_a_bug_exits_with_3_and_says_so(here, dfsm, monkeypatch):
     assert shown.code == 3
     assert shown.err.splitlines()[0] == "bug in dfsm: ZeroDivisionError: division by zero"
     assert "DFSM_DEBUG=1" in shown.err
+
+
+def test_a_warning_is_shown_once(here, dfsm, monkeypatch):
+    def twice(path):
+        for text in ("one", "two", "one"):
+            warnings.warn(text, DfsmWarning, stacklevel=1)
+        raise DfsmError("enough")
+
+    monkeypatch.setattr("dfsm.models.model_folder.load", twice)
+    for _ in range(2):  # each command by itself
+        assert dfsm("summary", "m").err.splitlines() == [
+            "warning: one",
+            "warning: two",
+            "error: enough",
+        ]
 
 
 @pytest.mark.parametrize("command", ["fit", "save"])

@@ -45,6 +45,20 @@ def test_rows_that_were_not_recorded_are_left_out(tmp_path):
     assert table(path, head).time[0] == T[20]
 
 
+def test_rows_filled_up_with_the_first_sample_are_left_out(tmp_path):
+    """As loggers do before a trigger: a motion stands still, and goes on at full speed."""
+    filled = LIVE.copy()
+    filled[:120], filled[120:] = LIVE[7], LIVE[7 : 7 + 280]
+    run = table(tmp_path / "a.csv", filled)
+    assert run.time[0] == T[119 + 1]
+    assert "the first 120 rows (0 to 11.9 s) hold the same values" in run.notes[0]
+    # A system at rest that a ramp sets in motion begins slowly.
+    u = np.maximum(0.0, T - 12) * 0.1
+    x = np.where(T < 12, 0.0, 0.1 * (T - 12 - 1 + np.exp(-(T - 12))))
+    at_rest = table(tmp_path / "b.csv", np.stack([u, x, x - 0.5 * u], axis=1))
+    assert (len(at_rest), at_rest.notes) == (400, ())
+
+
 def test_rest_and_what_settles_stay(tmp_path):
     u = np.where(T < 10, 0.0, 1.0)
     x = np.where(T < 10, 0.0, 1 - np.exp(-(T - 10)))

@@ -6,6 +6,7 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 
 import equinox as eqx
 import jax
@@ -438,6 +439,10 @@ def test_bad_input(runs, biased):
 def test_no_step_is_begun_after_the_time_given(runs, biased):
     result = refine(biased, runs, replace(CHOICES, seconds=0.0))
     assert len(result.history) == len(CHOICES.windows)
+    # Every length of windows has a share of it: half of it is for training on all runs.
+    settings = replace(CHOICES, windows=(5.0, 10.0), seconds=100.0)
+    course = trial.Course(biased, settings, (None, None), (), 0, perf_counter() - 40.0)
+    assert [late() for late in course.late_by_stage(0.0, 0.5)] == [True, False]
 
 
 def test_the_command_line_refines(here, dfsm):

@@ -10,6 +10,7 @@ import pytest
 from conftest import sentence
 from dfsm.data.readers import read
 from dfsm.data.readers.text import number
+from dfsm.errors import DfsmError
 
 TIME = 0.5 * np.arange(40)
 A, B = np.round(np.sin(TIME), 4), np.round(1000 * (1.5 + np.cos(TIME)), 1)
@@ -215,3 +216,19 @@ def test_names_in_a_comment_right_above_numbers(tmp_path):
     assert run.names == ("A", "B")
     np.testing.assert_array_equal(run.time, TIME)
     np.testing.assert_array_equal(run["B"], B)
+
+
+def test_blanks_between_thousands_where_blanks_separate_columns(tmp_path):
+    rows = [f"{0.5 * k:.1f}  {1 + k % 2} {37 * k:03d}.5  {k / 8:.3f}" for k in range(20)]
+    table = [row.replace(".", ",") for row in rows]
+    with pytest.raises(DfsmError) as error:
+        read(put(tmp_path / "a.txt", ["Time  P  v", *table]))
+    said = str(error.value)
+    assert "line 2: 4 values, but the header names 3 columns" in said
+    assert "if a blank sets thousands apart in it, as in 1 000.5, save the table without" in said
+    # A blank in a name makes as many cells of the header.
+    run = read(put(tmp_path / "b.txt", ["Time  Wind Speed  v", *table]))
+    assert any("'Wind' and 'Speed' look like one number with a blank" in n for n in run.notes)
+    # Three digits behind a whole number are two numbers as often.
+    other = [f"{0.5 * k:.1f} {1 + k % 2} {100 + k} {k / 8:.3f}" for k in range(20)]
+    assert read(put(tmp_path / "c.txt", ["Time a b v", *other])).notes == ()

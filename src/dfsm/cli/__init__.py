@@ -14,6 +14,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -361,7 +362,7 @@ def main() -> None:
 
 
 def _main() -> None:
-    warnings.showwarning = _show_warning
+    warnings.showwarning = partial(_show_warning, set[str]())
     warnings.simplefilter("always", DfsmWarning)
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A terminal that lacks a letter shows an escape instead of failing.
@@ -424,9 +425,14 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
-    if issubclass(category, DfsmWarning):
-        print(printable(f"warning: {message}"), file=sys.stderr)
+def _show_warning(
+    shown: set[str], message: Warning | str, category: type[Warning], *_: object
+) -> None:
+    """Print what was not printed before: a command may look at the same file several times."""
+    text = str(message)
+    if issubclass(category, DfsmWarning) and text not in shown:
+        shown.add(text)
+        print(printable(f"warning: {text}"), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,9 @@ from dfsm.numerics.time_mesh import uneven
 
 # What wind engineers usually choose; only names that exist are proposed. The rate of a rotor's
 # speed is none of its states: nothing that is recorded explains how it changes.
-_SECOND_ORDER = ("PtfmSurge", "PtfmHeave", "PtfmPitch", "TTDspFA")
+_SECOND_ORDER = ("PtfmSurge", "PtfmHeave", "PtfmPitch")
+# One deflection by two names of ElastoDyn; the second where the first is not recorded.
+TOWER_TOPS = ("TTDspFA", "YawBrTDxp")
 _FLOATING = {"PtfmSurge", "PtfmHeave", "PtfmPitch"}
 _SPEEDS = ("GenSpeed", "RotSpeed")
 _CONTROLS = ("GenTq", "BldPitch1")
@@ -34,7 +36,7 @@ WINDS = ("RotWind", "RtVAvgxh", "Wind1VelX")
 _WITH_WIND = ("RotShearV", "RotShearH", "Wave1Elev")
 # Waves reach a floating hull before they reach the point where their elevation is told.
 _AHEAD = (2, 4, 6)
-_TURBINE = {*_SECOND_ORDER, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
+_TURBINE = {*_SECOND_ORDER, *TOWER_TOPS, *_SPEEDS, *_CONTROLS, *_OUTPUTS, *WINDS}
 # RMS that is left of the rate of a state, and of a second derivative that nobody recorded, above
 # which a state is not to be told by derivatives alone: the latter are less sure on coarse samples.
 _CLEAR, _CLEAR_TWICE = 0.22, 0.1
@@ -124,7 +126,9 @@ def _of_turbine(
     rates: Mapping[str, str],
     reasons: dict[str, str],
 ) -> Proposal:
-    states = [_second_order(n, rates) for n in _SECOND_ORDER if n in varying]
+    tower = [n for n in TOWER_TOPS if n in varying][:1]
+    swinging = [n for n in _SECOND_ORDER if n in varying] + tower
+    states = [_second_order(n, rates) for n in swinging]
     speed = next((s for s in _SPEEDS if s in varying), None)
     if speed:
         states.append({"name": speed, "order": 1})

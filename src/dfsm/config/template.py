@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from dfsm.config.proposal import Proposal, propose
+from dfsm.config.proposal import TOWER_TOPS, Proposal, propose
 from dfsm.core.files import check_file, write_file
 from dfsm.core.types import Array
 from dfsm.data.features import Feature
@@ -181,7 +181,7 @@ def _refinement(proposed: Proposal) -> str:
     """Refinement with latent states; what controls drive would learn the controller."""
     driving = [*proposed.disturbances, *(Feature(**f).name for f in proposed.features)]
     # A tower swings several times as fast as a platform.
-    step = 0.25 if any(state["name"] == _TOWER for state in proposed.states) else 0.5
+    step = 0.25 if any(state["name"] in TOWER_TOPS for state in proposed.states) else 0.5
     if not driving:
         return _REFINE.format(latents="", step=step)
     states = sum(state["order"] for state in proposed.states)
@@ -255,7 +255,6 @@ _NO_CORRECTION = """\
 _REFINE = "{{windows: [20, 100], step: {step}, iterations: 10, {latents}seconds: 90}}"
 # How little coefficients may change: the more states, the more of them chance can use.
 _DECAY, _DECAY_OF_MANY, _FEW_STATES = 30, 1000, 5
-_TOWER = "TTDspFA"
 
 _LPV = """\
   kind: LPV           # LPV varies with the schedule; LTI does not (remove schedule, points)

@@ -16,6 +16,7 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dfsm.core.types import Array, IntArray
+from dfsm.data.signs import changes_regularly
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, missing
 from dfsm.numerics.time_mesh import same_instant
@@ -35,6 +36,8 @@ _GOES_ON = 0.35
 _TURNS, _FAST, _FEWEST = 0.5, 0.15, 30
 # A slow signal that is rounded stays and moves by one unit of its rounding, over so many levels.
 _ROUNDED = 20
+# Steps of rounding are alike, within such a share of the usual one.
+_ALIKE = 0.1
 # A line between two samples is an event that rises so many times as much as those beside it, as
 # those of the whole record, and over such a share of the range; so many intervals on each side are
 # beside it, and more events than such a share of the intervals are how the input is.
@@ -42,7 +45,11 @@ _SUDDEN, _MATTERS, _BESIDE, _FEW = 12.0, 0.02, 8, 0.1
 
 
 def is_held(values: Array) -> bool:
-    """Tell whether samples ``(time,)`` stay and jump, as those of a held input do."""
+    """Tell whether samples ``(time,)`` stay and jump, as those of a held input do.
+
+    One that jumps at regular moments, as a digital controller does, may follow a smooth signal, as
+    long as its steps are not all of one size: a slow signal that is rounded moves like that.
+    """
     steps = np.diff(values)
     moves = steps[steps != 0]
     if not len(moves) or len(moves) > (1 - _STAYS) * len(steps):
@@ -51,7 +58,12 @@ def is_held(values: Array) -> bool:
     goes_on = follows & (np.sign(steps[1:]) == np.sign(steps[:-1]))
     if goes_on.sum() > _GOES_ON * len(moves):
         return False
-    return bool(np.ptp(values) < _ROUNDED * np.median(np.abs(moves)))
+    sizes = np.abs(moves)
+    usual = np.median(sizes)
+    if np.ptp(values) < _ROUNDED * usual:
+        return True
+    differ = np.median(np.abs(sizes - usual)) > _ALIKE * usual
+    return bool(differ) and changes_regularly(values)
 
 
 class Roughness(NamedTuple):

@@ -2,7 +2,8 @@
 
 A system at rest looks alike at first: all its rows are the same until an input steps. Then only the
 input jumps, and the rest starts from where it stood. Rows that were not recorded end where (almost)
-all channels jump at once; a record that freezes stops (almost) all of them in mid-motion. Where
+all channels jump at once; a record that freezes stops (almost) all of them in mid-motion, or lets
+them go on from there, as what is filled up with the first sample does. Where
 much follows an input without delay, few channels tell rest from nothing: a state that starts from
 where it stood, closer than by chance, is enough.
 """
@@ -59,6 +60,10 @@ def recorded_rows(time: Array, values: Array) -> tuple[slice, list[str]]:
         else:
             start = head
             notes.append(f"{said}, as where nothing was recorded: left out")
+    elif head > _LONGER * _longest(values[head:]) and _moves_off(values[head - 1 :]):
+        start = head - 1  # the last of the equal rows is as it was
+        said = _told("first", values[:start], time[:start])
+        notes.append(f"{said}, and then move off at full speed, as what was not recorded: left out")
     if tail:
         back = values[: count - tail + 1][::-1]
         if _jumps(back):
@@ -134,6 +139,16 @@ def _freezes(values: Array) -> bool:
     _, usual, beside = _changes(values, _WHILE)
     moving = beside > _MOTION * usual
     return len(moving) > 0 and bool(moving.mean() >= _ALMOST_ALL)
+
+
+def _moves_off(values: Array) -> bool:
+    """Whether almost all channels are in motion at once behind the first row, the last equal one.
+
+    What rests until an input moves begins slowly, and where an input jumps, that alone is fast.
+    """
+    first, usual, _ = _changes(values, _BESIDE)
+    moving = first > _MOTION * usual
+    return len(moving) > 1 and bool(moving.mean() >= _ALMOST_ALL) and not _jumping(values).any()
 
 
 def _told(which: str, values: Array, time: Array) -> str:

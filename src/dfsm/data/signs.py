@@ -102,6 +102,11 @@ def held_interval(time: Array, values: Array) -> float | None:
     return None if every is None else float(np.median(np.diff(time[_changes(values)])))
 
 
+def changes_regularly(values: Array) -> bool:
+    """Whether samples ``(time,)`` stay as they are and change at regular ones."""
+    return _held(values) is not None
+
+
 def moments(values: Array) -> NDArray[np.bool_]:
     """Samples at which a held channel was recorded, ``(time,)``; all of one that is not held."""
     recorded, every = np.ones(len(values), dtype=bool), _held(values)

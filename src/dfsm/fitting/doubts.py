@@ -26,10 +26,18 @@ from dfsm.fitting.delays import (
     late_inputs,
     late_note,
 )
-from dfsm.fitting.feedback import Law, feedback_note, follows, is_feedback, much_unexplained
+from dfsm.fitting.feedback import (
+    Law,
+    alike_note,
+    feedback_note,
+    follows,
+    is_feedback,
+    much_unexplained,
+)
 from dfsm.fitting.linear import CONDITION_LIMIT, LinearFit
 from dfsm.fitting.noisy_inputs import noise_shares
 from dfsm.fitting.over_intervals import coarse_note
+from dfsm.fitting.regular_controls import course_of, own_course, poor_note
 from dfsm.fitting.residuals import Residuals, residuals_of
 from dfsm.fitting.rough_inputs import rough_note
 from dfsm.fitting.samples import Samples
@@ -42,6 +50,11 @@ from dfsm.numerics.time_mesh import std_over
 # A coefficient matters where its input makes so much of a row, and is not known where it is less
 # than so many standard errors.
 _MATTERS, _KNOWN = 0.2, 1.0
+# A delay of so many intervals is about one, and a control that the states explain to so much is
+# little else than they are.
+_A_SAMPLE, _THE_STATES = 2.0, 0.95
+# What makes a growth of the fit, and what no margin cures.
+_DECEPTIVE = ("feedback", "alike", "late")
 _EXCITE = "runs in which a set-point or a control is excited, or linear.known"
 
 
@@ -60,7 +73,7 @@ class Reason:
     """
 
     row: str
-    kind: Literal["feedback", "late", "noise", "chance", "rough", "coarse"]
+    kind: Literal["feedback", "alike", "late", "noise", "chance", "rough", "coarse"]
     text: str
     advice: str
 
@@ -95,7 +108,9 @@ class Doubts:
     @property
     def cured_by_margin(self) -> bool:
         """Whether a growth of the fit may be what `linear.margin` is there for."""
-        return self.outdated or not any(r.kind in ("feedback", "late") for r in self.reasons)
+        return self.outdated or not any(
+            r.kind in ("feedback", "alike", "late") for r in self.reasons
+        )
 
 
 def doubts(
@@ -153,7 +168,7 @@ def doubts(
         series = residuals_of(samples.times, inputs, target, left[:, place])
         note = late = early = None
         if series is not None:
-            late = _late(series, names[:driving], settings)
+            late, alike = _late(series, names[:driving], settings, samples)
             first = len(samples.signals.controls)
             early = late_inputs(series, range(first, driving), early=True) if not late else None
             states = samples.signals.state_columns
@@ -170,9 +185,13 @@ def doubts(
                     reasons.append(Reason(name, "late", "a lag is missing in it", cure))
                 continue
             note = _feedback(samples, series, mean, row, held, laws)
-        if note:
-            notes.append(note)
-            reasons.append(Reason(name, "feedback", "feedback biases it", _EXCITE))
+            if note is None and alike is not None and much_unexplained(series):
+                effect = float(mean[row, alike.column])
+                text = alike_note(name, series.unexplained, names[alike.column], effect, alike)
+                note = text, Reason(name, "alike", "a control is little else than it", _EXCITE)
+        if note is not None:
+            notes.append(note[0])
+            reasons.append(note[1])
             continue
         if not fit.moved:  # for a margin it is no longer the best fit
             told = _unknown(name, names, mean[row], errors[row], samples, target, fit.condition)
@@ -203,7 +222,9 @@ def doubts(
             reasons += [Reason(name, "late", what, "what is told of it")] * (not early.small)
         elif series is not None and fit.model.schedule is None:
             free = [c for c in range(len(samples.signals.controls)) if c not in held]
-            for twice in pulled(series, free):
+            fine = residuals_of(samples.times, inputs, target, left[:, place], inputs_too=True)
+            noisy = any(r.row == name and r.kind == "noise" for r in reasons)
+            for twice in [] if fine is None or noisy else pulled(fine, free):
                 notes.append(pulled_note(name, names[twice.column], twice))
                 reasons.append(
                     Reason(
@@ -216,21 +237,37 @@ def doubts(
     return Doubts(tuple(notes), errors, tuple(reasons), False, worst, held_channels)
 
 
-def _late(series: Residuals, names: Sequence[str], settings: FitSettings) -> LateInputs | None:
-    """Delays that are not there as features yet, to a sample: what these leave is no new delay."""
+def _late(
+    series: Residuals, names: Sequence[str], settings: FitSettings, samples: Samples
+) -> tuple[LateInputs | None, Law | None]:
+    """Delays that are not there as features yet, to a sample: what these leave is no new delay.
+
+    Nor is one of about a sample in a control that is little else than the states: what these were
+    a sample ago is their derivative. Then its law is the other answer. Nor one of so few sines that
+    a delay is a coefficient too many: late, they are what other coefficients make of them.
+    """
     given = [(f.source, f.seconds) for f in settings.features if f.kind == "delay" and f.seconds]
-
-    def there(column: int, seconds: float) -> bool:
-        near = max(series.sample, series.step)
-        return any(names[column] == n and abs(seconds - s) <= near for n, s in given)
-
-    columns = list(range(len(names)))
+    near = max(series.sample, series.step)
+    order = samples.signals.order
+    states, controls = order.columns("states"), len(samples.signals.controls)
+    columns, alike = list(range(len(names))), None
+    acting = states.stop - states.start
     while (late := late_inputs(series, columns)) is not None:
-        again = [c for c, seconds in late.seconds.items() if there(c, seconds)]
+        again = set[int]()
+        for column, seconds in late.seconds.items():
+            made = course_of(series, column)
+            there = any(names[column] == n and abs(seconds - s) <= near for n, s in given)
+            if there or (made is not None and made.directions < 2 + acting):
+                again.add(column)
+            elif column < controls and seconds <= _A_SAMPLE * near:
+                law = follows(series, column, range(states.start, states.stop))
+                if law.explained > _THE_STATES:
+                    again.add(column)
+                    alike = law
         if not again:
-            return late
+            break
         columns = [c for c in columns if c not in again]
-    return None
+    return late, alike
 
 
 def _state_of(samples: Samples, row: int) -> StateSpec:
@@ -297,27 +334,39 @@ def _feedback(
     row: int,
     held: set[int],
     laws: dict[int, Law],
-) -> str | None:
+) -> tuple[str, Reason] | None:
+    """What to tell of controls that states and their past tell, and of which kind that is."""
     if not much_unexplained(series):
         return None
     order = samples.signals.order
     states = order.columns("states")
     A = mean[:, states]
-    told = []
+    name = samples.derivative_names[row][0]
+    told, poor = [], None
     for column in range(len(samples.signals.controls)):
         if column in held or not mean[row, column]:
             continue
         if column not in laws:
             laws[column] = follows(series, column, range(states.start, states.stop))
-        if is_feedback(laws[column], A, mean[:, column]):
+        if not is_feedback(laws[column], A, mean[:, column]):
+            continue
+        course = own_course(series, column, A)
+        if course is None:
             told.append(column)
-    if not told:
-        return None
-    names = [order.names[c] for c in told]
-    name = samples.derivative_names[row][0]
-    return feedback_note(
-        name, series.unexplained, names, mean[row, told].tolist(), [laws[c] for c in told]
-    )
+            continue
+        acting = 1 + int(np.count_nonzero(mean[row, states]))
+        if course.directions < acting and poor is None:
+            poor = poor_note(name, order.names[column], course, acting, series.unexplained)
+    if told:
+        names = [order.names[c] for c in told]
+        note = feedback_note(
+            name, series.unexplained, names, mean[row, told].tolist(), [laws[c] for c in told]
+        )
+        return note, Reason(name, "feedback", "feedback biases it", _EXCITE)
+    if poor is not None:
+        what = "a control has too few frequencies to tell its effect"
+        return poor, Reason(name, "chance", what, "runs in which it has more")
+    return None
 
 
 def _unknown(

@@ -47,10 +47,13 @@ class Law:
     gain
         What the control does where the states have been for about as long as it remembers,
         ``(state,)``.
+    column
+        Of the inputs.
     """
 
     explained: float
     gain: Array
+    column: int
 
 
 def follows(residuals: Residuals, control: int, states: Sequence[int]) -> Law:
@@ -86,7 +89,7 @@ def follows(residuals: Residuals, control: int, states: Sequence[int]) -> Law:
     free = len(u) / (2 * memory) - len(law)
     chance = 1.0 if free <= 0 else (len(u) / (2 * memory)) / free
     explained = 1 - min(1.0, chance * left / max(total, np.finfo(float).tiny))
-    return Law(explained, gain)
+    return Law(explained, gain, control)
 
 
 def _regressed(u: Array, inputs: Array) -> tuple[Array, float]:
@@ -151,4 +154,15 @@ def feedback_note(
         "it, so do not believe either; train with runs in which a set-point or the control itself "
         "is excited, or that have the same disturbances and other controls, or set linear.known; "
         "damping the fit would only hide this"
+    )
+
+
+def alike_note(row: str, unexplained: float, control: str, coefficient: float, law: Law) -> str:
+    """That a control and the states cannot be told apart, and what to do."""
+    return (
+        f"{row}: {unexplained:.0%} of it is unexplained and '{control}' is little else than the "
+        f"states and their past ({law.explained:.1%} of its variance), so what it does cannot be "
+        f"told from what these do: do not believe its effect ({coefficient:.3g}), nor the "
+        "eigenvalues; if a controller chose it, train with runs in which a set-point or the "
+        "control itself is excited, or set linear.known"
     )

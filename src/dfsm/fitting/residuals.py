@@ -16,8 +16,9 @@ from dfsm.core.types import Array
 from dfsm.numerics.least_squares import correlation_length
 from dfsm.numerics.time_mesh import parts_of
 
-# Intervals per correlation time of the residual, and the most of them in all runs together.
-_PER_CORRELATION = 10
+# Intervals per correlation time of the residual, or per so many of the input that remembers least,
+# and the most of them in all runs together.
+_PER_CORRELATION, _OF_INPUTS = 10, 4
 _MOST = 10_000
 
 
@@ -59,7 +60,11 @@ class Residuals:
 
 
 def residuals_of(
-    times: Sequence[Array], inputs: Array, target: Array, left: Array
+    times: Sequence[Array],
+    inputs: Array,
+    target: Array,
+    left: Array,
+    inputs_too: bool = False,
 ) -> Residuals | None:
     """Average one row over intervals.
 
@@ -69,6 +74,9 @@ def residuals_of(
         Of the samples of every run, one after the other, each ``(time,)``.
     inputs, target, left
         As in `Residuals`, ``(sample, input)`` and ``(sample,)``.
+    inputs_too
+        Whether intervals are short for the inputs as well. Over longer ones states have already
+        answered what acts on them, so that the next value of a series is no news any more.
 
     Returns
     -------
@@ -78,6 +86,10 @@ def residuals_of(
     parts = list(zip(times, parts_of(times), strict=True))
     step = sample = min(float(np.median(np.diff(time))) for time in times)
     memory = float(np.mean([_memory(time, left[part]) for time, part in parts]))
+    if inputs_too:
+        moving = [column for column in inputs.T if np.ptp(column) > 0]
+        own = [np.mean([_memory(time, column[part]) for time, part in parts]) for column in moving]
+        memory = min(memory, _OF_INPUTS * float(min(own, default=memory)))
     together = sum(float(time[-1] - time[0]) for time in times)
     step = max(step, memory / _PER_CORRELATION, together / _MOST)
 

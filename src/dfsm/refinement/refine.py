@@ -34,7 +34,7 @@ from dfsm.models.dfsm import DFSM
 from dfsm.models.latents import with_latent_range
 from dfsm.models.signals import Provenance
 from dfsm.refinement.settings import RefineSettings
-from dfsm.refinement.trial import Course, Trial, train_on_all, try_out
+from dfsm.refinement.trial import LATE, Course, Trial, train_on_all, try_out
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,15 @@ def refine(
     hold_out = checked(settings.hold_out, "refine.hold_out")
     parts = divisions(data, hold_out, seed, common, start, stop)
     course = Course(model, settings, (start, stop), common, seed)
-    trials = [try_out(course, *part) for part in parts]
+    # Training on all runs has as much of the time as each division.
+    last = len(settings.windows) - 1
+    shares = np.linspace(0, 1, len(parts) + 2).tolist()
+    trials = [try_out(course, *part, *shares[k : k + 2]) for k, part in enumerate(parts)]
     first = trials[0]
     before, after = _means(trials)
     history, ended = list(first.history), list(first.ended)
     parameters, at, records = first.parameters, first.best, [*first.train, *first.held]
     if len(trials) == 1 and after < before and not course.late():
-        last = len(settings.windows) - 1
         count = sum(entry["stage"] == last for entry in history)
         problem = course.problem(parameters, records, settings.windows[-1])
         at, entries, why = train_on_all(problem, at, count, course.late)
@@ -145,10 +147,10 @@ def refine(
         history = [{"split": k, **entry} for k, t in enumerate(trials) for entry in t.history]
         steps = np.median([t.steps for t in trials], axis=0)
         parameters = course.parameters(records)
-        at = np.zeros(parameters.size)
+        at, late = np.zeros(parameters.size), course.late_by_stage(*shares[-2:])
         for stage, (length, count) in enumerate(zip(settings.windows, steps, strict=True)):
             problem = course.problem(parameters, records, length)
-            at, entries, why = train_on_all(problem, at, round(count), course.late)
+            at, entries, why = train_on_all(problem, at, round(count), late[stage])
             history += [{"stage": stage, **entry} for entry in entries]
             ended.append(why)
     refined = parameters.at(from_host(at))
@@ -156,7 +158,7 @@ def refine(
         seen = first.train if len(trials) == 1 else records
         paths = [record.latent_states(refined) for group in seen for record in group]
         refined = with_latent_range(refined, paths)
-    return _result(model, refined, trials, (history, ended))
+    return _result(model, refined, trials, (history, ended), last)
 
 
 def _means(trials: Sequence[Trial]) -> tuple[float, float]:
@@ -172,6 +174,7 @@ def _result(
     refined: DFSM,
     trials: Sequence[Trial],
     account: tuple[Sequence[dict[str, float]], Sequence[str]],
+    last: int,
 ) -> RefineResult:
     history, ended = account
     before, after = _means(trials)
@@ -198,12 +201,14 @@ def _result(
             ]
         model = replace(refined, provenance=Provenance(record))
     else:
-        tried = [e["validation"] for e in history if "validation" in e]
+        # Over windows of the last length: shorter ones have smaller errors.
+        tried = [e["validation"] for e in history if "validation" in e and e["stage"] == last]
         best = f", at best {np.sqrt(min(tried)):.3g} after a step" if tried else ""
+        advice = "more refine.seconds, " if LATE in ended else ""
         message = (
             "refinement did not lower the error of rollouts over the runs held out "
             f"({np.sqrt(before):.3g} standard deviations{best}; {ended[-1]}), so the model it "
-            "started from is returned: use more runs, or shorter refine.windows"
+            f"started from is returned: use {advice}more runs, or shorter refine.windows"
         )
         warnings.warn(message, DfsmWarning, stacklevel=3)
     splits = tuple((t.before, t.after) for t in trials)

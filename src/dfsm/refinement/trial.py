@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 
 import numpy as np
@@ -25,7 +25,7 @@ from dfsm.refinement.start import start_latents, start_network
 
 # Steps without progress on the validation runs after which a stage ends.
 _PATIENCE = 6
-_LATE = "the time was up (refine.seconds)"
+LATE = "the time was up (refine.seconds)"
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,20 @@ class Course:
         """How much each error counts."""
         return _weights(self.model, self.settings)
 
-    def late(self) -> bool:
-        """Whether the time is up."""
+    def late(self, share: float = 1.0) -> bool:
+        """Whether the time is up, or such a share of it."""
         limit = self.settings.seconds
-        return limit is not None and clock.perf_counter() - self.began > limit
+        return limit is not None and clock.perf_counter() - self.began > share * limit
+
+    def late_by_stage(self, begin: float, end: float) -> list[Callable[[], bool]]:
+        """Whether the time of each stage is up, all together having some shares of the whole.
+
+        What windows of the first length have learnt need not hold over the last, and is lost where
+        these have no time left.
+        """
+        count = len(self.settings.windows)
+        shares = [begin + (end - begin) * (k + 1) / count for k in range(count)]
+        return [partial(self.late, share) for share in shares]
 
     def records(self, part: Dataset) -> list[list[Record]]:
         """What rollouts are compared with, in groups of runs with the same disturbances."""
@@ -105,8 +115,20 @@ def _spread(runs: Sequence[Record]) -> Array:
     return np.sqrt(np.mean([np.mean(r.slopes**2, axis=0) for r in runs], axis=0))
 
 
-def try_out(course: Course, training: Dataset, validation: Dataset) -> Trial:
-    """Train on some of the runs until the others are no longer met better."""
+def try_out(
+    course: Course, training: Dataset, validation: Dataset, begin: float = 0.0, end: float = 1.0
+) -> Trial:
+    """Train on some of the runs until the others are no longer met better.
+
+    Parameters
+    ----------
+    course
+        Model and settings.
+    training, validation
+        The division of the runs.
+    begin, end
+        Shares of the time at which this division begins and ends.
+    """
     settings = course.settings
     train, held = course.records(training), course.records(validation)
     runs = [record for group in train for record in group]
@@ -119,10 +141,11 @@ def try_out(course: Course, training: Dataset, validation: Dataset) -> Trial:
     history: list[dict[str, float]] = []
     ended: list[str] = []
     steps: list[int] = []
+    late = course.late_by_stage(begin, end)
     for stage, length in enumerate(settings.windows):
         problem = course.problem(parameters, train, length)
         check = RolloutError(parameters, held, length, course.weights)
-        at, entries, taken, why = _stage(problem, check, at, settings.iterations, course.late)
+        at, entries, taken, why = _stage(problem, check, at, settings.iterations, late[stage])
         history += [{"stage": stage, **entry} for entry in entries]
         ended.append(why)
         steps.append(taken)
@@ -197,7 +220,7 @@ def _stage(
             why = f"no better on the runs held out for {_PATIENCE} steps"
             return best, history, taken, why
         if late():
-            return best, history, taken, _LATE
+            return best, history, taken, LATE
     return best, history, taken, _reason(steps, limit)
 
 
@@ -212,7 +235,7 @@ def train_on_all(
         at = step.weights
         history.append({"training": problem.relative(at)})
         if late():
-            return at, history, _LATE
+            return at, history, LATE
     return at, history, _reason(steps, limit)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -29,6 +30,9 @@ _GROUPED = re.compile(
 _PERCENT = re.compile(r"\s*[-+]?[\d.,]*\d[\d.,]*\s*%\s*")
 # Rows in which percent signs are looked for.
 _LOOKED_AT = 200
+# Such a number in a table whose cells blanks separate: what stands before its blank, and behind it.
+_BEFORE_BLANK = re.compile(r"[-+]?[1-9]\d{0,2}")
+_BEHIND_BLANK = re.compile(r"\d{3}(?:[.,]\d*)?")
 # Whole numbers, in either way of writing: one alone does not tell which.
 _THOUSANDS = {sign: re.compile(rf"\s*[-+]?[1-9]\d{{0,2}}(?:[{sign}]\d{{3}})+\s*") for sign in ",."}
 
@@ -106,6 +110,43 @@ def _ungrouped(rows: list[Row], separator: str) -> tuple[list[Row], str]:
     if not first:
         return rows, ""
     return tidy, f"thousands are set apart, as in {first}: read as whole numbers"
+
+
+def split_thousands(cells: Sequence[str]) -> str:
+    """First number that a blank between its thousands may have made two cells of; "" for none."""
+    for before, behind in pairwise(cells):
+        if _BEFORE_BLANK.fullmatch(before) and _BEHIND_BLANK.fullmatch(behind):
+            return f"{before} {behind}"
+    return ""
+
+
+def thousands_in_columns(names: Sequence[str], rows: Sequence[Row]) -> str:
+    """Tell of two columns that are one number with a blank between its thousands, by their digits.
+
+    Parameters
+    ----------
+    names
+        Of the columns.
+    rows
+        Of a table whose cells blanks separate.
+
+    Returns
+    -------
+    str
+        "" where no column has three digits everywhere, zeros at the head among them, behind one of
+        whole numbers.
+    """
+    full = [row.cells for row in rows if len(row.cells) == len(names)]
+    for j, (before, behind) in enumerate(pairwise(names)):
+        zeros = next((cells for cells in full if re.match(r"0\d\d", cells[j + 1])), None)
+        if zeros is None:
+            continue
+        if all(split_thousands(cells[j : j + 2]) for cells in full):
+            return (
+                f"'{before}' and '{behind}' look like one number with a blank between its "
+                f"thousands, {zeros[j]} {zeros[j + 1]}: if so, save the table without such blanks"
+            )
+    return ""
 
 
 def without_percent(rows: list[Row], channels: Sequence[Channel]) -> tuple[list[Row], set[int]]:

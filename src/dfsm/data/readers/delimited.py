@@ -25,7 +25,12 @@ from dfsm.data.readers.columns import (
     rate_step,
     uniform_times,
 )
-from dfsm.data.readers.decimals import with_points, without_percent
+from dfsm.data.readers.decimals import (
+    split_thousands,
+    thousands_in_columns,
+    with_points,
+    without_percent,
+)
 from dfsm.data.readers.guard import unguarded
 from dfsm.data.readers.headers import (
     BLANKS,
@@ -108,6 +113,8 @@ def read_delimited(path: Path, step: float | None = None) -> Trajectory:
         rate, channel = time, channels[time]
         told, note = seconds_of(channel.name, channel.unit, columns[time])
         notes = [note, capital_note(channel.name, channel.unit)]
+    if header.separator == BLANKS:
+        notes.append(thousands_in_columns([c.name for c in channels], rows))
     keep, left_out = kept_columns(path, channels, columns, rate)
     if time is not None:
         keep, left_out = without_more_times(path, channels, columns, time, (keep, left_out))
@@ -168,4 +175,9 @@ def _cure(row: list[str], columns: int, separator: str) -> str:
     whole = all(re.fullmatch(r"\s*[-+]?\d+\s*", cell) for cell in row)
     if separator == "," and whole and columns < len(row) <= 2 * columns:
         return "if its decimals have commas, save it with points; else correct or remove the line"
+    if separator == BLANKS and columns < len(row) and (number := split_thousands(row)):
+        return (
+            f"if a blank sets thousands apart in it, as in {number}, save the table without, or "
+            "with semicolons between its columns; else correct or remove the line"
+        )
     return "correct or remove the line"

@@ -17,6 +17,8 @@ from dfsm.fitting.settings import FitSettings
 # RMS that a fit leaves of a derivative, relative to its standard deviation, from which the state
 # is not told by what is recorded.
 _MUCH = 0.8
+# What is to be mended before: the past of a control that is little else than the states is theirs.
+_FIRST = ("alike", "late", "rough", "coarse")
 
 
 def hidden_advice(
@@ -47,7 +49,7 @@ def hidden_advice(
     told = {s.name: _of_state(s.name, decisions) for s in settings.states}
     rates = {s.rate for s in settings.states}
     told = {n: left for n, left in told.items() if left >= _MUCH and n not in rates}
-    first = {_base(r.row) for r in doubt.reasons if r.kind in ("late", "rough", "coarse")}
+    first = {_base(r.row) for r in doubt.reasons if r.kind in _FIRST}
     told = {n: left for n, left in told.items() if n not in first}
     if not told or not driving:
         return []
