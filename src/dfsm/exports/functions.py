@@ -15,7 +15,7 @@ from dfsm.data.trajectory import Channel
 from dfsm.errors import DfsmError
 from dfsm.exports.program import Program
 from dfsm.exports.translate import UntranslatableError, translated
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.inputs import GROUPS as INPUTS
 from dfsm.models.latents import at_rest
 from dfsm.models.point import functions_of_points
@@ -46,6 +46,7 @@ def programs(model: DFSM) -> dict[str, Program]:
     DfsmError
         A term is a function with something in it that no program can have; names both.
     """
+    require_model(model)
     inputs = [(group, len(getattr(model.signals, group))) for group in GROUPS]
     turning = [(TURNING[0], 1), (TURNING[1], len(model.signals.field))]
     f, g = functions_of_points(model)
@@ -110,6 +111,7 @@ def _refusal(model: DFSM, primitive: str) -> str:
 
 def description(model: DFSM) -> dict[str, Any]:
     """Names and units of all vectors, start values, and what must be known to use the model."""
+    require_model(model)
     s, start = model.signals, starting_values(model)
     groups = (*GROUPS, "outputs", "field")
     told: dict[str, Any] = {"dfsm": __version__}

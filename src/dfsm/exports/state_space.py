@@ -17,7 +17,7 @@ from dfsm.core.version import __version__
 from dfsm.data.channel import Channel
 from dfsm.errors import DfsmError, DfsmWarning
 from dfsm.models.control_system import control_system
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.steady import operating_point, steady_state
 
 if TYPE_CHECKING:
@@ -264,6 +264,7 @@ def to_state_space(
     DfsmWarning
         Some points have no steady state.
     """
+    require_model(model)
     values = _values(model, schedule)
     held = {
         group: _rows(group, given, len(model.signals.names(group)), len(values))

@@ -12,7 +12,7 @@ from dfsm.controllers.state_space import StateFeedback, regulator_gain
 from dfsm.core.host import from_host
 from dfsm.core.settings import require, require_kind, require_number
 from dfsm.errors import DfsmError, missing
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.steady import SteadyState
 
 
@@ -59,7 +59,7 @@ def linear_quadratic(
         A state or control that the model does not have, a deviation or an interval that is not
         positive, or no such regulator.
     """
-    require_kind("model", model, DFSM, "a model: dfsm.load reads one, and a fit has one")
+    require_model(model)
     require_kind("point", point, SteadyState, "a steady state, as dfsm.steady_state finds it")
     require_number("interval", interval, INTERVAL, above=0)
     for where, told in (("states", states), ("integral", integral or {}), ("controls", controls)):

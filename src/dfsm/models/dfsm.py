@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 import dfsm.core.jax_setup  # noqa: F401
 from dfsm.core.drawing import Shown
 from dfsm.core.host import from_host
+from dfsm.core.settings import require_kind
 from dfsm.core.types import Array, ComplexArray
 from dfsm.data.trajectory import labels
 from dfsm.errors import DfsmError, printable
@@ -382,6 +383,19 @@ def corrected(
     place = {row: k for k, row in enumerate(rows)}
     extra = corrective(inputs)
     return jnp.stack([v + extra[place[i]] if i in place else v for i, v in enumerate(total)])
+
+
+def require_model(model: object, name: str = "model") -> None:
+    """Refuse what is no model, as the result of a fit, which has one.
+
+    Raises
+    ------
+    DfsmError
+        What came, and what was expected.
+    """
+    require_kind(
+        name, model, DFSM, "a model: dfsm.load reads one, and the result of a fit has one, .model"
+    )
 
 
 @eqx.filter_jit

@@ -21,7 +21,7 @@ from dfsm.core.files import check_folder, visible
 from dfsm.core.types import Array
 from dfsm.errors import DfsmError
 from dfsm.models.corrective import FORMS, Corrective
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.folder_check import RecordCheck, check_model
 from dfsm.models.linear import LinearModel
 from dfsm.models.passing import Passing
@@ -53,6 +53,8 @@ def save(model: DFSM, path: str | Path, nonlinear: DFSM | None = None) -> None:
         `path` holds something else, or cannot be written.
     """
     models = {MULTI_FIDELITY: model} | ({NONLINEAR: nonlinear} if nonlinear is not None else {})
+    for one in models.values():
+        require_model(one)
     tensors: dict[str, Array] = {}
     structure = {name: _take_apart(m, name, tensors) for name, m in models.items()}
     content = {

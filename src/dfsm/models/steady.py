@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from dfsm.core.types import Array, ComplexArray
 from dfsm.errors import DfsmError
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 
 # Damped least squares: steps have no part along which nothing changes, so that a state that nothing
 # depends on (an azimuth, say) stays put, and they do not run away as Newton's do.
@@ -79,6 +79,7 @@ def steady_state(
     DfsmError
         The schedule value is missing or outside the training range.
     """
+    require_model(model)
     start = operating_point(model, schedule)
     x, u, w, p = model.split(start)
     u = u if controls is None else jnp.asarray(controls, dtype=float)

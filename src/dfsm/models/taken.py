@@ -8,7 +8,7 @@ from dfsm.data.features import guessed_ends
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmWarning
 from dfsm.models.completion import completed
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.signals import require_constant
 
 
@@ -47,6 +47,7 @@ def model_inputs(
     DfsmWarning
         Channels were converted, or delayed and leading inputs are not in the record at its ends.
     """
+    require_model(model)
     s = model.signals
     names = [*s.exogenous, *s.names("field")]
     whole = completed(run, s)

@@ -30,7 +30,7 @@ from dfsm.data.dataset import Dataset
 from dfsm.data.hold_out import checked, divisions
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmWarning, printable
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.latents import with_latent_range
 from dfsm.models.signals import Provenance
 from dfsm.refinement.settings import RefineSettings
@@ -121,6 +121,7 @@ def refine(
     DfsmWarning
         Refinement did not help and its start is returned.
     """
+    require_model(model)
     settings = settings or RefineSettings()
     data, common = Dataset(runs), ()
     if settings.correlation:

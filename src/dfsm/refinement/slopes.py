@@ -267,7 +267,8 @@ def sensitivities(
     kept, _ = spread_steps(steps, every)
     keep = np.zeros(len(parts[0]) * size // every, dtype=int)
     keep[: len(kept)] = kept % size
-    _, S = jax.lax.scan(along, slopes0[1], (tuple(parts), keep.reshape(len(parts[0]), -1)))
+    chosen = jnp.asarray(keep.reshape(len(parts[0]), -1))
+    _, S = jax.lax.scan(along, slopes0[1], (tuple(parts), chosen))
     return S.reshape(-1, observed, w.size)[: len(kept)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dfsm.core.version import __version__
 from dfsm.fitting.verdicts import TRENDS, USABLE
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.stability import told_growths
 from dfsm.report.article import Article, Figure, Section, Table, listed
 from dfsm.report.article_page import write_article
@@ -44,6 +44,7 @@ def write_model_card(model: DFSM, path: str | Path, *, name: str = "model") -> N
     DfsmError
         The file cannot be written.
     """
+    require_model(model)
     write_article(card_article(model, name), path)
 
 

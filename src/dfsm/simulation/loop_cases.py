@@ -18,7 +18,7 @@ from dfsm.data.between import Between
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.signals import require_constant, require_field
 from dfsm.simulation.loop import Drive
 from dfsm.simulation.simulate import initial_azimuth, initial_state
@@ -120,7 +120,7 @@ def checked_loops(
     DfsmError
         One of them is not what it should be, or there are no runs.
     """
-    require_kind("model", model, DFSM, "a model: dfsm.load reads one, and a fit has one")
+    require_model(model)
     of_runs = "runs: dfsm.read reads one, dfsm.read_all several"
     if isinstance(runs, str | Mapping):
         require_kind("runs", runs, Trajectory, of_runs)

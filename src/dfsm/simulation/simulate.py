@@ -23,7 +23,7 @@ from dfsm.data.features import guessed_ends
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed, completed
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.recorded import recorded_states
 from dfsm.models.signals import require_constant, require_field
 from dfsm.simulation.fastest import REACH, fastest_rates
@@ -154,6 +154,7 @@ def simulate(
         Channels were converted to the model's units, a rollout was outside the training range for
         part of the time, took shorter steps than asked for, or ended early.
     """
+    require_model(model)
     settings = settings or SimulationSettings()
     single = isinstance(runs, Trajectory)
     batch = [runs] if isinstance(runs, Trajectory) else list(runs)

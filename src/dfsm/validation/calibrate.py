@@ -20,7 +20,7 @@ from dfsm.data.dataset import Dataset
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError
 from dfsm.models.completion import all_completed
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.simulation.simulate import SimulationSettings
 from dfsm.validation.growth import RolloutErrors, law_of
 from dfsm.validation.intervals import Intervals
@@ -70,6 +70,7 @@ def calibrate(
     DfsmError
         Too few runs, one that occurs twice, a rollout that ended early, or a level outside (0, 1).
     """
+    require_model(model)
     require(0 < level < 1, "level", level, "a share between 0 and 1")
     s = model.signals
     runs = all_completed(list(runs), s)

@@ -20,7 +20,7 @@ from dfsm.data.features import known_window
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.completion import all_completed
-from dfsm.models.dfsm import DFSM
+from dfsm.models.dfsm import DFSM, require_model
 from dfsm.models.recorded import Recorded, recorded_states
 from dfsm.models.signals import Azimuth, radians_per_second
 from dfsm.numerics.fatigue import damage_by_exponent
@@ -84,8 +84,11 @@ def validate(
     DfsmError
         No runs, a channel that a run lacks, or intervals of another model.
     """
-    if isinstance(models, DFSM):
+    if not isinstance(models, Mapping):
+        require_model(models, "models")
         models = compared(models)
+    for name, model in models.items():
+        require_model(model, f"models['{name}']")
     first = next(iter(models.values()))
     if intervals is not None:
         if MULTI_FIDELITY not in models:
