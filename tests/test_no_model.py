@@ -1,4 +1,4 @@
-"""What is no model, as the result of a fit, is refused in one sentence wherever a model is taken."""
+"""What is no model, as the result of a fit, is refused in one sentence wherever it is taken."""
 
 from __future__ import annotations
 
