@@ -229,9 +229,8 @@ def test_slopes_written_out_are_those_of_the_model(model, kind):
         there = parameters.at(at)
         found = np.zeros((3, parameters.size))
         weight = rng.normal()
-        found[:1] = (
-            written(at, there, point[None, None], jnp.full((1, 1, 1, 1), weight))[0] / weight
-        )
+        rows = written(at, there, point[None, None], jnp.full((1, 1, 1, 1), weight))[0]
+        found[:1] = rows / weight
         found[1:, parameters.latent_columns[0]] = of_latents(there, point)[0]
         np.testing.assert_allclose(found, slopes(at, point), rtol=1e-9, atol=1e-12)
 
