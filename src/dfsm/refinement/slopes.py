@@ -12,6 +12,7 @@ err with the square of the step, and need a quarter of the evaluations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -131,11 +132,10 @@ def state_matrix(model: DFSM, inputs: jax.Array) -> jax.Array:
     return A
 
 
-def _by_block(function: Any, *arrays: jax.Array) -> jax.Array:
+def _by_block(function: Callable[[jax.Array], jax.Array], inputs: jax.Array) -> jax.Array:
     """A function of steps, block by block, so that what lies between stays in the cache."""
-    steps = len(arrays[0])
-    blocks = [_blocks(a, min(_BLOCK, steps), "edge") for a in arrays]
-    each = jax.lax.map(lambda one: function(*one), tuple(blocks))
+    steps = len(inputs)
+    each = jax.lax.map(function, _blocks(inputs, min(_BLOCK, steps), "edge"))
     return each.reshape(-1, *each.shape[2:])[:steps]
 
 

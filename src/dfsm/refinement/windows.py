@@ -180,16 +180,18 @@ def _wake_slopes(
     def target(now: jax.Array, latent: jax.Array, inputs: jax.Array) -> jax.Array:
         return wake_targets(moved(now), inputs.at[s.pair_columns].set(latent))
 
+    def following(now: jax.Array, targets: jax.Array) -> jax.Array:
+        return wakes_following(moved(now), step, targets)
+
+    now, targets = w[terms], jax.vmap(partial(wake_targets, model))(inputs)
     # Backwards: a wake has two numbers and dozens of parameters.
     by_time = jax.vmap(jax.jacrev(target, (0, 1)), (None, 0, 0))
-    by_term, by_latent = by_time(w[terms], latent, inputs)
+    by_term, by_latent = by_time(now, latent, inputs)
     by_pair = by_latent.reshape(*by_latent.shape[:3], -1, 2)
     by_pair = jnp.einsum("trakc,tkcp->trakp", by_pair, pairs)
     slopes = [by_term, by_pair.reshape(*by_term.shape[:3], -1)]
-    now, targets = w[terms], jax.vmap(partial(wake_targets, model))(inputs)
 
     def follow(direction: jax.Array, slopes: jax.Array) -> jax.Array:
-        following = lambda now, targets: wakes_following(moved(now), step, targets)  # noqa: E731
         return jax.jvp(following, (now, targets), (direction, slopes))[1]
 
     directions = jnp.eye(len(now) + own.size, len(now))
