@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from dfsm.cli import app
+from dfsm.config.template import write_config
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "examples" / "iea15"
@@ -23,6 +24,7 @@ def test_python_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         name = f"iea15_2dof_{speed}mps_s09.outb"
         shutil.copy(DATA / name, tmp_path / folder / name)
     monkeypatch.chdir(tmp_path)
+    write_config(["runs/*.outb"], Path("config.yaml"))
     exec(compile(code, "README.md", "exec"), {})
     assert "my turbine" in (tmp_path / "report.html").read_text(encoding="utf-8")
 

@@ -240,7 +240,9 @@ def summary(
     """Describe a saved model: signals, decisions, eigenvalues, warnings."""
     from dfsm.models.model_folder import load
 
-    typer.echo(lines(load(model).summary()))
+    loaded = load(model)
+    # A file or another program is given whole lines.
+    typer.echo(lines(str(loaded) if sys.stdout.isatty() else loaded.summary()))
 
 
 @app.command()

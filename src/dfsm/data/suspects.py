@@ -58,7 +58,7 @@ def screened(
         Channels to look at; those that a run lacks are passed over.
     what
         ``"refuse"``; ``"drop"`` bridges stray samples by straight lines and leaves out runs in
-        another unit; ``"keep"`` looks at nothing.
+        another unit; ``"keep"`` refuses only what cannot be squared.
     window
         Start and stop in s of what is compared between runs.
     settings
@@ -70,9 +70,11 @@ def screened(
     DfsmError
         Names the run, the channel and the time of the first suspect, or the factor.
     """
-    if what == "keep":
-        return list(runs)
     names = list(dict.fromkeys(names))
+    if what == "keep":
+        for run in runs:
+            _require_squares(run, [n for n in names if n in run])
+        return list(runs)
     kept = [
         _without_strays(
             run, [n for n in names if n in run], what, lead_in(run, window[0], settings)
@@ -124,6 +126,23 @@ def _excited_less(
     return bool((ratio >= abs(np.log(factor)) / 2 - _NEAR).all())
 
 
+def _require_squares(run: Trajectory, names: Sequence[str]) -> None:
+    """Refuse values of which no sum of squares is a number.
+
+    Raises
+    ------
+    DfsmError
+        Names the run, the channel and the time of the first.
+    """
+    for name in names:
+        large = np.flatnonzero(np.abs(run[name]) > _HUGE)
+        if len(large):
+            raise DfsmError(
+                f"{run.where}: '{name}' is {run[name][large[0]]:.4g} at {run.time[large[0]]:g} s, "
+                "which cannot be squared in 64 bits: correct it, or give it in a larger unit"
+            )
+
+
 def _without_strays(
     run: Trajectory, names: Sequence[str], what: Suspects, used: Trajectory
 ) -> Trajectory:
@@ -137,9 +156,12 @@ def _without_strays(
         if what == "refuse" or len(strays) > _FEW:
             first = strays[0]
             more = f" (and {len(strays) - 1} more)" if len(strays) > 1 else ""
+            few = len(strays) <= _FEW
+            others = "all its other samples" if few else "what can be squared in 64 bits"
+            advice = _ADVICE if few else "correct them, or give the channel in a larger unit"
             raise DfsmError(
                 f"{run.where}: '{name}' is {samples[first]:.4g} at {run.time[first]:g} s{more}, "
-                f"far beyond all its other samples: {_ADVICE}"
+                f"far beyond {others}: {advice}"
             )
         good = np.ones(len(samples), dtype=bool)
         good[strays] = False

@@ -94,6 +94,7 @@ def check(
         doubts=None if doubt.outdated else doubt,
         growths=growing,
         refined=doubt.outdated,
+        discarded=model.provenance.record.get("refinement", {}).get("improved") is False,
         records={name: f"'{name}' is held between its samples" for name in held}
         | {name: f"the rate that is named with '{name}' is not its own" for name in wrong},
         grows=grows,

@@ -45,6 +45,8 @@ class Evidence:
         Of the whole model.
     refined
         Whether rollouts taught the model.
+    discarded
+        Whether what they taught was no better on runs held out.
     records
         What is wrong with records of states or inputs, by channel.
     grows
@@ -56,6 +58,7 @@ class Evidence:
     doubts: Doubts | None
     growths: Sequence[Growth]
     refined: bool
+    discarded: bool = False
     records: Mapping[str, str] = field(default_factory=dict)
     grows: float | None = None
 
@@ -143,7 +146,10 @@ def _advice(name: str, settings: FitSettings, evidence: Evidence) -> tuple[str, 
     if unstable and settings.hidden is not None:
         return ", and the model is unstable", "fewer hidden states (hidden.count), or hidden.stable"
     if unstable and settings.linear.margin is None:
-        return ", and the model is unstable", "linear.margin, or refine"
+        more = "" if evidence.discarded else ", or refine"
+        return ", and the model is unstable", f"linear.margin{more}"
+    if evidence.discarded:
+        return "", "what is told of refinement, which was no better on the runs held out"
     if not evidence.refined and name not in settings.outputs:
         return "", "refine, which teaches the model on rollouts"
     if settings.linear.kind == "LTI" and settings.disturbances:

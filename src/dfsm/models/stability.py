@@ -72,7 +72,7 @@ class Growth:
             return "UNSTABLE"
         if self.integrates:
             return "integrator"
-        return "growth within its standard error" if self.unclear else ""
+        return "growth within two standard errors" if self.unclear else ""
 
 
 def growths(model: DFSM, seconds: float, errors: Array | None = None) -> list[Growth]:

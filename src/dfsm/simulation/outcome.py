@@ -26,6 +26,8 @@ from dfsm.simulation.integrate import Rollout
 
 # A rollout ends where a state is this many times its training half-range from the middle.
 ESCAPE = 10.0
+# An input this share of its training range outside of it may be why.
+_FAR_INPUT = 0.5
 
 
 class Status(enum.Enum):
@@ -33,8 +35,9 @@ class Status(enum.Enum):
 
     COMPLETED = "completed"
     LEFT_REGION = (
-        "stopped where a state left the training range by a factor of ten: the model is unstable "
-        "there; look at its eigenvalues, or train on runs that cover this case"
+        "stopped where a state left the training range by a factor of ten: train on runs that "
+        "cover this case; where no input explains it, the model is unstable there: look at its "
+        "eigenvalues"
     )
     NOT_FINITE = (
         "stopped where a state was no longer finite: use a smaller step or a stiff method, and "
@@ -177,6 +180,8 @@ def judge(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) ->
             f"{s.states[column].name} reached {x[end, column]:.4g} {s.states[column].unit} at "
             f"{driven.time[end]:g} s (training range {low[column]:.4g} to {high[column]:.4g})"
         )
+        if status is Status.LEFT_REGION:
+            reason += _driven_there(model, driven.values[: end + 1])
         # The sample where it left shows which way the model went.
         end += status is Status.LEFT_REGION
     values = np.concatenate([x, rollout.outputs], axis=1)[: max(2, end)]
@@ -198,6 +203,26 @@ def judge(model: DFSM, run: Trajectory, driven: Trajectory, rollout: Rollout) ->
         outside=float(mean_over(left, _weights(driven.time[:end]))),
         strayed=strayed,
         distance=np.sqrt(rollout.distance[: len(values)]),
+    )
+
+
+def _driven_there(model: DFSM, values: Array) -> str:
+    """The exogenous input that was farthest outside its training range, if by half of that or more.
+
+    `values` are exogenous inputs along the rollout, ``(time, exogenous)``.
+    """
+    s, region = model.signals, model.region
+    columns = [[c.name for c in s.inputs].index(name) for name in s.exogenous]
+    low, high = np.asarray(region.low)[columns], np.asarray(region.high)[columns]
+    beyond = np.maximum(values - high, low - values).max(axis=0)
+    share = beyond / np.maximum(high - low, np.finfo(float).tiny)
+    if not len(columns) or share.max() < _FAR_INPUT:
+        return ""
+    k = int(np.argmax(share))
+    worst = values[int(np.argmax(np.maximum(values[:, k] - high[k], low[k] - values[:, k]))), k]
+    return (
+        f", while its input {s.exogenous[k]} was at {worst:.4g} (training range {low[k]:.4g} to "
+        f"{high[k]:.4g})"
     )
 
 
