@@ -51,3 +51,15 @@ def test_refinement_in_vain_is_not_advised_again() -> None:
     }
     assert told[False].startswith("refine, ")
     assert "no better on the runs held out" in told[True]
+
+
+def test_a_stray_sample_of_a_test_run_is_told() -> None:
+    """Else its error is taken for the model's."""
+    model = linear_model(np.array([[-1.0]]), np.ones((1, 1)))
+    x = 1 - np.exp(-TIME)
+    wrong = x.copy()
+    wrong[50] = 1e6
+    with hushed():
+        plain, told = (dfsm.validate(model, [run_of(v, 1.0)]).warnings for v in (x, wrong))
+    assert not any("far beyond" in text for text in plain)
+    assert any("'x0' is 1e+06 at 5 s, far beyond all its other samples" in text for text in told)

@@ -126,6 +126,21 @@ def _excited_less(
     return bool((ratio >= abs(np.log(factor)) / 2 - _NEAR).all())
 
 
+def stray_notes(run: Trajectory, names: Sequence[str]) -> list[str]:
+    """Say which samples of a run, not of a fit, are far from all others, one sentence a channel."""
+    notes = []
+    for name in names:
+        rows = stray_rows(run[name])
+        if len(rows):
+            more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+            notes.append(
+                f"{run.where}: '{name}' is {run[name][rows[0]]:.4g} at {run.time[rows[0]]:g} s"
+                f"{more}, far beyond all its other samples: errors of this run say nothing until "
+                "that is corrected"
+            )
+    return notes
+
+
 def _require_squares(run: Trajectory, names: Sequence[str]) -> None:
     """Refuse values of which no sum of squares is a number.
 

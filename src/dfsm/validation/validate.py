@@ -17,6 +17,7 @@ from dfsm.core.types import Array
 from dfsm.core.units import factor
 from dfsm.data.conversion import converted
 from dfsm.data.features import known_window
+from dfsm.data.suspects import stray_notes
 from dfsm.data.trajectory import Trajectory
 from dfsm.errors import DfsmError, hushed
 from dfsm.models.completion import all_completed
@@ -105,6 +106,8 @@ def validate(
     for run in runs:
         run.columns(first.signals.recorded)
     notes = [*converted(given, runs), *_leaks(first, runs, intervals)]
+    for run in runs:
+        notes += stray_notes(run.window(start, stop), first.signals.recorded)
     results, late, early = list[RunComparison](), list[str](), list[str]()
     for run in track(runs, "test runs"):
         known, until = known_window(run, first.signals.features, start, stop)
