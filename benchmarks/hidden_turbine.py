@@ -20,9 +20,9 @@ import numpy as np
 
 import dfsm
 from benchmarks.accuracy import bundled
+from benchmarks.rollouts import nrmse
 from dfsm.config.fit import load_config
 from dfsm.config.template import write_config
-from dfsm.core.types import Array
 
 # Where tests begin, in s, which leaves `hidden` enough of the record to tell where its states are.
 _START = 130.0
@@ -101,14 +101,10 @@ def _errors(model: dfsm.DFSM, tests: Mapping[str, list[dfsm.Trajectory]]) -> dic
             path = rollout.trajectory
             truth = [np.interp(path.time, run.time, run[name]) for name in _STATES]
             pairs = zip(_STATES, truth, strict=True)
-            found.append([_nrmse(path[_own(path, name)], recorded) for name, recorded in pairs])
+            found.append([nrmse(path[_own(path, name)], recorded) for name, recorded in pairs])
         whole = len(found) == len(runs)
         errors[group] = np.mean(found, axis=0).tolist() if whole else None
     return errors
-
-
-def _nrmse(simulated: Array, recorded: Array) -> float:
-    return float(np.sqrt(np.mean((simulated - recorded) ** 2)) / recorded.std())
 
 
 def _own(path: dfsm.Trajectory, name: str) -> str:

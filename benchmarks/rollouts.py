@@ -160,8 +160,8 @@ def judged(runs: Sequence[dfsm.Trajectory], states: Sequence[Array | None]) -> d
         if values is None:
             continue
         truth = recorded(run)
-        low.append(_nrmse(_low_passed(run, values), _low_passed(run, truth)))
-        whole.append(_nrmse(values, truth))
+        low.append(nrmse(_low_passed(run, values), _low_passed(run, truth)))
+        whole.append(nrmse(values, truth))
     none = [float("nan")] * len(STATES)
     mean = [np.mean(part, axis=0).tolist() if part else none for part in (low, whole)]
     return {
@@ -189,7 +189,8 @@ def low_passed(values: Array, step: float, cutoff: float) -> Array:
     return sosfiltfilt(butter(4, cutoff, fs=1 / step, output="sos"), values, axis=0)
 
 
-def _nrmse(predicted: Array, truth: Array) -> Array:
+def nrmse(predicted: Array, truth: Array) -> Array:
+    """RMS error over the standard deviation of the record, by column."""
     return np.sqrt(np.mean((predicted - truth) ** 2, axis=0)) / truth.std(axis=0)
 
 
@@ -215,8 +216,8 @@ def _load(
     there, here = (spectrum(recorded.time, v) for v in (truth, predicted))
     damage = [damage_equivalent_load(v, recorded.duration, 4) for v in (truth, predicted)]
     return {
-        "nrmse": float(_nrmse(predicted, truth)),
-        "nrmse_filtered": float(_nrmse(*(_low_passed(recorded, v) for v in (predicted, truth)))),
+        "nrmse": float(nrmse(predicted, truth)),
+        "nrmse_filtered": float(nrmse(*(_low_passed(recorded, v) for v in (predicted, truth)))),
         "del_ratio": damage[1] / damage[0],
         "peak_bins": {b.name: _bins_apart(there, here, b) for b in (PLATFORM, WAVE)},
         "power_ratio": {b.name: here.power(b) / there.power(b) for b in (LOW, passing)},

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from dfsm.controllers.pid import PID
 from dfsm.core.host import from_host
 from dfsm.data.derivatives import DerivativeSettings, StateSpec
 from dfsm.data.trajectory import Channel, Trajectory
@@ -227,3 +228,17 @@ def cost_slopes(
     eps = 1e-6
     steps = eps * np.eye(at.size)
     return [(problem.cost(at + d) - problem.cost(at - d)) / (2 * eps) for d in steps]
+
+
+def law(kp: float) -> PID:
+    """PI with an integral gain of 0.1, from a position `q` in m to a force `u0` in N."""
+    return PID(
+        kp=kp,
+        ki=0.1,
+        setpoint=0.2,
+        measurements=["q"],
+        measurement_units=["m"],
+        commands=["u0"],
+        command_units=["N"],
+        interval=0.1,
+    )

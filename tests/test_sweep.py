@@ -15,17 +15,10 @@ import dfsm as package
 from dfsm.data.readers import read
 from dfsm.errors import DfsmError
 from dfsm.loops.load_cases import Figures
-from systems import driving_run, linear_model
+from systems import driving_run, law, linear_model
 
 A, B = np.array([[0.0, 1.0], [-4.0, -0.6]]), np.array([[0.0, 0.0], [2.0, 0.5]])
 TIME = np.arange(0, 20.01, 0.1)
-
-
-def law(kp):
-    return package.PID(
-        kp=kp, ki=0.1, setpoint=0.2, measurements=["q"], measurement_units=["m"],
-        commands=["u0"], command_units=["N"], interval=0.1,
-    )  # fmt: skip
 
 
 def test_a_sweep_holds_what_each_loop_does_and_what_a_life_of_them_does():

@@ -19,16 +19,9 @@ import dfsm as package
 from conftest import write_config
 from dfsm.errors import DfsmError
 from dfsm.loops import sweep_journal
-from systems import driving_run, linear_model
+from systems import driving_run, law, linear_model
 
 TIME = np.arange(0, 20.01, 0.1)
-
-
-def law(kp):
-    return package.PID(
-        kp=kp, ki=0.1, setpoint=0.2, measurements=["q"], measurement_units=["m"],
-        commands=["u0"], command_units=["N"], interval=0.1,
-    )  # fmt: skip
 
 
 class Stepped:

@@ -15,7 +15,7 @@ from dfsm.core.types import Array
 from dfsm.data.signs import held_interval, jumps_at_first, transient_end, wrapping
 from dfsm.data.slower import slower_warning
 from dfsm.data.stuck import stuck_notes
-from dfsm.data.suspects import stray_rows
+from dfsm.data.suspects import stray_rows, strays_told
 from dfsm.data.trajectory import Channel, Trajectory
 from dfsm.data.wind import wind_warning
 from dfsm.numerics.time_mesh import mean_over, std_over, weights_over_time
@@ -245,11 +245,9 @@ def _looks(channel: Channel, values: Array, time: Array) -> list[str]:
     """What a channel is, from its name and its samples."""
     sentences, name, unit = [], channel.name, channel.unit
     if len(strays := stray_rows(values)):
-        first = strays[0]
-        more = f" (and {len(strays) - 1} more)" if len(strays) > 1 else ""
         sentences.append(
-            f"'{name}' is {values[first]:.4g} at {time[first]:g} s{more}, far beyond all "
-            "its other samples: correct it, or set data.outliers to drop"
+            f"{strays_told(name, time, values, strays)}, far beyond all its other samples: correct "
+            "it, or set data.outliers to drop"
         )
     if wrap := wrapping(time, values, unit):
         sentences.append(

@@ -132,11 +132,9 @@ def stray_notes(run: Trajectory, names: Sequence[str]) -> list[str]:
     for name in names:
         rows = stray_rows(run[name])
         if len(rows):
-            more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
             notes.append(
-                f"{run.where}: '{name}' is {run[name][rows[0]]:.4g} at {run.time[rows[0]]:g} s"
-                f"{more}, far beyond all its other samples: errors of this run say nothing until "
-                "that is corrected"
+                f"{run.where}: {strays_told(name, run.time, run[name], rows)}, far beyond all its "
+                "other samples: errors of this run say nothing until that is corrected"
             )
     return notes
 
@@ -150,11 +148,11 @@ def _require_squares(run: Trajectory, names: Sequence[str]) -> None:
         Names the run, the channel and the time of the first.
     """
     for name in names:
-        large = np.flatnonzero(np.abs(run[name]) > _HUGE)
-        if len(large):
+        rows = _huge_rows(run[name])
+        if len(rows):
             raise DfsmError(
-                f"{run.where}: '{name}' is {run[name][large[0]]:.4g} at {run.time[large[0]]:g} s, "
-                "which cannot be squared in 64 bits: correct it, or give it in a larger unit"
+                f"{run.where}: {strays_told(name, run.time, run[name], rows)}, which cannot be "
+                "squared in 64 bits: correct it, or give it in a larger unit"
             )
 
 
@@ -169,14 +167,12 @@ def _without_strays(
         if not len(strays):
             continue
         if what == "refuse" or len(strays) > _FEW:
-            first = strays[0]
-            more = f" (and {len(strays) - 1} more)" if len(strays) > 1 else ""
             few = len(strays) <= _FEW
             others = "all its other samples" if few else "what can be squared in 64 bits"
             advice = _ADVICE if few else "correct them, or give the channel in a larger unit"
             raise DfsmError(
-                f"{run.where}: '{name}' is {samples[first]:.4g} at {run.time[first]:g} s{more}, "
-                f"far beyond {others}: {advice}"
+                f"{run.where}: {strays_told(name, run.time, samples, strays)}, far beyond "
+                f"{others}: {advice}"
             )
         good = np.ones(len(samples), dtype=bool)
         good[strays] = False
@@ -189,7 +185,7 @@ def _without_strays(
 def stray_rows(samples: Array) -> IntArray:
     """Rows of the samples that are huge, or a few that are far from all others."""
     finite = np.isfinite(samples)
-    huge = _rows(samples, lambda part: np.isfinite(part) & (np.abs(part) > _HUGE))
+    huge = _huge_rows(samples)
     if len(huge) or len(samples) <= 2 * _FEW:
         return huge
     good = samples if finite.all() else samples[finite]
@@ -206,6 +202,16 @@ def stray_rows(samples: Array) -> IntArray:
         if far[count] > 0 and far[count - 1] > _STRAY * far[count]:
             return np.sort(order[:count])
     return huge
+
+
+def strays_told(name: str, time: Array, samples: Array, rows: IntArray) -> str:
+    """The first of some samples of a channel, and how many more there are."""
+    more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+    return f"'{name}' is {samples[rows[0]]:.4g} at {time[rows[0]]:g} s{more}"
+
+
+def _huge_rows(samples: Array) -> IntArray:
+    return _rows(samples, lambda part: np.isfinite(part) & (np.abs(part) > _HUGE))
 
 
 def _off(samples: Array, middle: float) -> Array:

@@ -214,15 +214,13 @@ def _driven_there(model: DFSM, values: Array) -> str:
     s, region = model.signals, model.region
     columns = [[c.name for c in s.inputs].index(name) for name in s.exogenous]
     low, high = np.asarray(region.low)[columns], np.asarray(region.high)[columns]
-    beyond = np.maximum(values - high, low - values).max(axis=0)
-    share = beyond / np.maximum(high - low, np.finfo(float).tiny)
-    if not len(columns) or share.max() < _FAR_INPUT:
+    share = np.maximum(values - high, low - values) / np.maximum(high - low, np.finfo(float).tiny)
+    if not share.size or share.max() < _FAR_INPUT:
         return ""
-    k = int(np.argmax(share))
-    worst = values[int(np.argmax(np.maximum(values[:, k] - high[k], low[k] - values[:, k]))), k]
+    at, k = np.unravel_index(int(np.argmax(share)), share.shape)
     return (
-        f", while its input {s.exogenous[k]} was at {worst:.4g} (training range {low[k]:.4g} to "
-        f"{high[k]:.4g})"
+        f", while its input {s.exogenous[k]} was at {values[at, k]:.4g} "
+        f"(training range {low[k]:.4g} to {high[k]:.4g})"
     )
 
 

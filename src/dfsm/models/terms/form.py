@@ -57,8 +57,12 @@ class Term(eqx.Module):
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """The values at one input vector, shape ``(input,)`` to ``(value,)``."""
+        return self.values(self._signals(inputs))
+
+    def _signals(self, inputs: jax.Array) -> jax.Array:
+        """What it takes of one input vector, ``(input,)`` to ``(signal,)``."""
         # One by one: of a gather nobody can tell on which inputs its values depend.
-        return self.values(jnp.stack([inputs[column] for column in self.columns]))
+        return jnp.stack([inputs[column] for column in self.columns])
 
     def of_numbers(self, signals: Sequence[jax.Array]) -> jax.Array:
         """The values of single numbers, one per signal; `values` but for the last digits.
@@ -85,7 +89,7 @@ class Term(eqx.Module):
 
     def slopes(self, inputs: jax.Array) -> jax.Array:
         """∂φ/∂I at one input vector, ``(input,)`` to ``(value, input)``."""
-        signals = jnp.stack([inputs[column] for column in self.columns])
+        signals = self._signals(inputs)
         by_number = jax.jacrev(self.of_effective)(self.effective(signals))
         by_signal = by_number @ jax.jacrev(self.effective)(signals)
         none = jnp.zeros((len(self.channels), inputs.shape[0]))
@@ -108,7 +112,7 @@ class Term(eqx.Module):
         """
         if not deviations:
             return jnp.zeros((len(self.channels), 0))
-        signals = jnp.stack([inputs[column] for column in self.columns])
+        signals = self._signals(inputs)
 
         def effective(theta: list[jax.Array]) -> jax.Array:
             return self.moved(theta).effective(signals)
