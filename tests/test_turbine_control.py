@@ -22,7 +22,7 @@ from dfsm.fitting.fit import fit
 from dfsm.report import write_solution_report
 from dfsm.report.publish import publish
 from systems import linear_model
-from turbine_article import CLAIMS, control_article, trends
+from turbine_article import CLAIMS, answer_section, control_article, trends
 from turbine_control import ControlStudy, ControlStudySettings, optimize, steady_gains, study
 from turbine_problem import (
     BEST_COEFFICIENT,
@@ -243,6 +243,10 @@ def test_the_page_holds_every_series_and_the_figures_every_limit(
         "problems were solved."
     )
     best = {r.most_pitch: r.power for r in found.results if r.case.key == "b"}
+    few = [replace(r, available=r.power / 2) if r.case.key == "a" else r for r in found.results]
+    told = answer_section(replace(found, results=tuple(few))).figures[0].caption
+    assert "not to be believed, for the wind holds less: case a of" in told
+    assert "case b" not in told
     # A telephone's first screen holds them and the figure.
     assert len(article.lede + " ".join(article.sections[0].paragraphs)) < 200
     asked = " ".join(article.sections[1].paragraphs)

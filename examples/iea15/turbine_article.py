@@ -95,10 +95,26 @@ def control_article(study: ControlStudy) -> Article:
 # -- the answer ---------------------------------------------------------------------------------
 
 
+def _beyond_the_wind(study: ControlStudy) -> list[str]:
+    """Series whose model has more power than their wind holds, with both powers."""
+    told = []
+    for (name, key), by_limit in study.series().items():
+        solved = [r for r in by_limit.values() if r.solution.solved]
+        if not solved:
+            continue
+        most, available = _most(solved)
+        if most > available:
+            told.append(f"case {key} of {_short(name)}, {most:.1f} of {available:.1f} MW")
+    return told
+
+
 def answer_section(study: ControlStudy) -> Section:
     """How many problems were solved, and the power at every limit of the platform pitch."""
     solved = [r for r in study.results if r.solution.solved]
     verdict = f"{len(solved)} of {len(study.results)} problems were solved."
+    caption = "Mean electrical power of the optimum over the limit of the platform pitch"
+    if beyond := _beyond_the_wind(study):
+        caption += f"; not to be believed, for the wind holds less: {'; '.join(beyond)}"
     curves: dict[str, list[Curve]] = {}
     for (name, key), by_limit in study.series().items():
         limits, power = _solved(by_limit)
@@ -109,7 +125,7 @@ def answer_section(study: ControlStudy) -> Section:
     most = 1.1 * max((r.power for r in solved), default=1.0)
     figure = Figure(
         "control_power",
-        "Mean electrical power of the optimum over the limit of the platform pitch",
+        caption,
         tuple(
             Panel(f"case {key}", "Θp,max (deg)", "power (MW)", tuple(of), y_range=(0.0, most))
             for key, of in curves.items()
@@ -215,8 +231,13 @@ def trends(by_limit: Mapping[float, Result]) -> dict[str, str]:
 
 def _powers(solved: Sequence[Result]) -> str:
     """The highest power and what the wind holds."""
-    most, available = max(r.power for r in solved), solved[0].available
+    most, available = _most(solved)
     return f"{_word(most <= available)}: {most:.2f} of {available:.2f} MW"
+
+
+def _most(solved: Sequence[Result]) -> tuple[float, float]:
+    """The highest power of a series, and what its wind holds, in MW."""
+    return max(r.power for r in solved), solved[0].available
 
 
 def _rising(values: Sequence[float]) -> str:
